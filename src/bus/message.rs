@@ -1,0 +1,174 @@
+//! Messages out: the fix message, one layout for Zenoh, `fixes.jsonl` and `locate --json`.
+
+use crate::geo::LatLon;
+use crate::locate::{Answer, Evidence, Latency, PriorSource, Reason, StageName};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// `fix` or `no_fix`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Status {
+    /// A position.
+    Fix,
+    /// None; see `reason`.
+    NoFix,
+}
+
+/// One answer, as published. Without a fix the optional fields are absent: not stale, not zero.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct FixMessage {
+    /// Exposure, Unix UTC nanoseconds.
+    pub stamp_ns: i64,
+    /// Counts the messages of this process (of a replay: the rows), from 0.
+    pub seq: u64,
+    /// Fix or not.
+    pub status: Status,
+    /// Why not; absent with a fix.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reason: Option<Reason>,
+    /// The reason in words: what was expected, what was found; absent with a fix.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub detail: Option<String>,
+    /// Latitude of the vehicle, WGS84 degrees.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lat_deg: Option<f64>,
+    /// Longitude of the vehicle, WGS84 degrees.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lon_deg: Option<f64>,
+    /// East-north covariance, square metres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub covariance_enu_m2: Option<[[f64; 2]; 2]>,
+    /// Radius that holds the truth with probability 0.95, metres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub radius95_m: Option<f64>,
+    /// Radius that holds the truth with probability 0.999, metres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub radius999_m: Option<f64>,
+    /// Whether the stated error was calibrated. False without a fix.
+    pub calibrated: bool,
+    /// Recovered yaw of image up, degrees clockwise from true north.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub yaw_deg: Option<f64>,
+    /// Recovered frame metres / assumed metres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub scale: Option<f64>,
+    /// Which stage the result comes from.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stage: Option<StageName>,
+    /// W_S, metres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub window_m: Option<f64>,
+    /// Rectified-frame px (512 x 512 at 1 m/px) -> window px at 1 m/px; row-major, `[2][2] == 1`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub homography: Option<[[f64; 3]; 3]>,
+    /// The window searched; absent where none was made.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub window: Option<WindowMessage>,
+    /// Named numbers for or against the fix.
+    pub evidence: Evidence,
+    /// Bundle name.
+    pub bundle: String,
+    /// The map.
+    pub map: MapId,
+    /// The prior used; absent where there was none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub prior: Option<PriorEcho>,
+    /// Milliseconds by step.
+    pub latency_ms: Latency,
+}
+
+/// The searched window.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct WindowMessage {
+    /// Latitude of its middle.
+    pub lat_deg: f64,
+    /// Longitude of its middle.
+    pub lon_deg: f64,
+    /// Side, metres.
+    pub width_m: f64,
+    /// Window px (1 m/px) -> map CRS: x' = a x + b y + c, y' = d x + e y + f.
+    pub map_affine: [f64; 6],
+}
+
+/// Which map.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct MapId {
+    /// File name.
+    pub name: String,
+    /// SHA-256 of the file, lower-case hex.
+    pub digest: String,
+}
+
+/// The prior, as used.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct PriorEcho {
+    /// Who said so.
+    pub source: PriorSource,
+    /// How many own fixes deep.
+    pub chain: u32,
+    /// Latitude.
+    pub lat_deg: f64,
+    /// Longitude.
+    pub lon_deg: f64,
+    /// Search radius, metres.
+    pub radius_m: f64,
+    /// 1-sigma per axis, metres, where given so.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sigma_m: Option<f64>,
+    /// Age at exposure, seconds.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub age_s: Option<f64>,
+}
+
+impl FixMessage {
+    /// The message for an answer.
+    pub fn new(stamp_ns: i64, seq: u64, answer: &Answer, bundle: &str, map: &MapId) -> Self {
+        let (fix, no_fix) = match &answer.outcome {
+            Ok(fix) => (Some(fix), None),
+            Err(no_fix) => (None, Some(no_fix)),
+        };
+        Self {
+            stamp_ns,
+            seq,
+            status: if fix.is_some() { Status::Fix } else { Status::NoFix },
+            reason: no_fix.map(|n| n.reason),
+            detail: no_fix.map(|n| n.detail.clone()),
+            lat_deg: fix.map(|f| f.position.lat_deg),
+            lon_deg: fix.map(|f| f.position.lon_deg),
+            covariance_enu_m2: fix.map(|f| f.covariance_enu_m2),
+            radius95_m: fix.map(|f| f.radius95_m),
+            radius999_m: fix.map(|f| f.radius999_m),
+            calibrated: fix.is_some_and(|f| f.calibrated),
+            yaw_deg: fix.map(|f| f.yaw_deg),
+            scale: fix.map(|f| f.scale),
+            stage: fix.map(|f| f.stage),
+            window_m: answer.window.map(|w| w.width_m),
+            homography: fix.map(|f| f.homography),
+            window: answer.window.map(|w| WindowMessage {
+                lat_deg: w.centre.lat_deg,
+                lon_deg: w.centre.lon_deg,
+                width_m: w.width_m,
+                map_affine: w.map_affine,
+            }),
+            evidence: answer.evidence.clone(),
+            bundle: bundle.to_owned(),
+            map: map.clone(),
+            prior: answer.prior.map(|p| PriorEcho {
+                source: p.source,
+                chain: p.chain,
+                lat_deg: p.position.lat_deg,
+                lon_deg: p.position.lon_deg,
+                radius_m: p.radius_m,
+                sigma_m: p.sigma_m,
+                age_s: p.age_s,
+            }),
+            latency_ms: answer.latency_ms.clone(),
+        }
+    }
+
+    /// The position, with a fix.
+    pub fn position(&self) -> Option<LatLon> {
+        LatLon::new(self.lat_deg?, self.lon_deg?)
+    }
+}

@@ -1,0 +1,13 @@
+//! `nightfix run`.
+
+use super::{Common, Outcome, UsageError};
+
+/// Arguments of `nightfix run`.
+#[derive(Debug, clap::Args)]
+pub struct Args {}
+
+/// Runs it.
+pub fn run(common: &Common, args: Args) -> Result<Outcome, UsageError> {
+    let _ = (common, args);
+    Err(UsageError("not built yet".into()))
+}

@@ -1,0 +1,166 @@
+//! The configuration. Every default stands once: in `config/nightfix.toml`, which is compiled in and on which a
+//! user's file is laid. Unknown keys are errors with line and column.
+
+use crate::thermal::CameraModel;
+use serde::Deserialize;
+use std::path::PathBuf;
+
+/// The whole configuration.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Settings {
+    /// Vehicle.
+    pub vehicle: VehicleSettings,
+    /// Map.
+    pub map: MapSettings,
+    /// Bundle.
+    pub bundle: BundleSettings,
+    /// ONNX Runtime.
+    pub onnxruntime: OnnxRuntimeSettings,
+    /// Camera.
+    pub camera: CameraModel,
+    /// Prior and tracking.
+    pub track: TrackSettings,
+    /// Gates.
+    pub gates: GateSettings,
+    /// Error budget.
+    pub budget: BudgetSettings,
+    /// Zenoh.
+    pub zenoh: ZenohSettings,
+    /// Daemon.
+    pub daemon: DaemonSettings,
+}
+
+/// Who we are.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct VehicleSettings {
+    /// One chunk of the Zenoh key: letters, digits, `-`, `_`.
+    pub name: String,
+}
+
+/// Which map.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MapSettings {
+    /// GeoTIFF.
+    pub path: Option<PathBuf>,
+    /// Bound on decoded tiles, MiB.
+    pub cache_mib: usize,
+}
+
+/// Which bundle.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BundleSettings {
+    /// Folder of the bundle.
+    pub path: Option<PathBuf>,
+}
+
+/// ONNX Runtime.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OnnxRuntimeSettings {
+    /// Shared library; searched beside the executable where absent.
+    pub library: Option<PathBuf>,
+    /// `cpu`, `cuda`, `tensorrt` or `xnnpack`. One that is not available is an error, never a silent fall-back.
+    pub provider: String,
+    /// Threads within one graph.
+    pub threads: usize,
+}
+
+/// Priors and tracking.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrackSettings {
+    /// Fastest the vehicle moves, metres per second: growth of uncertainty with age.
+    pub max_speed_mps: f64,
+    /// Least 1-sigma per axis of a prior taken from an own fix, metres.
+    pub own_fix_sigma_m: f64,
+    /// "No fix" in a row after which the last external prior is taken again.
+    pub fall_back_after_no_fix: u32,
+    /// Seconds since the last own fix after which the last external prior is taken again.
+    pub fall_back_after_s: f64,
+    /// Age beyond which an external prior is stale, seconds.
+    pub max_prior_age_s: f64,
+}
+
+/// Gates. `enabled = false` (replay `--gates off`) leaves only what has no answer: reasons up to `non_finite`.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GateSettings {
+    /// Whether gates from `implausible_quad` on close.
+    pub enabled: bool,
+    /// Least share of valid map under a footprint (`off_map`, `nodata`).
+    pub min_map_valid: f64,
+    /// Least share of the frame's square that the sensor saw (`footprint_too_small`).
+    pub min_frame_valid: f64,
+    /// Least standard deviation of the 8-bit frame (`flat_frame`).
+    pub min_frame_std: f64,
+    /// Largest |scale - 1| of the quad.
+    pub max_scale_error: f64,
+    /// Largest turn of the quad against the assumed yaw, degrees.
+    pub max_rotation_deg: f64,
+    /// Least ratio of opposite sides of the quad.
+    pub min_side_ratio: f64,
+    /// Least posterior mass round the coarse peak (`low_evidence`).
+    pub min_peak_mass: f64,
+    /// Largest ratio of the second peak to the first (`ambiguous`).
+    pub max_second_peak: f64,
+    /// Largest distance between the coarse and the refined centre, metres (`low_evidence`).
+    pub max_stage_shift_m: f64,
+    /// Largest weighted residual of the refine stage's patches, metres (`low_evidence`).
+    pub max_refine_residual_m: f64,
+}
+
+/// Error budget, 1-sigma.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BudgetSettings {
+    /// Attitude error per axis, degrees; times height above ground.
+    pub sigma_tilt_deg: f64,
+    /// Attitude error where pitch and roll are unknown and nadir is assumed, degrees.
+    pub sigma_tilt_unknown_deg: f64,
+    /// Height above ground assumed for the tilt term where it is unknown, metres.
+    pub assumed_agl_m: f64,
+    /// Absolute accuracy of the map per axis, metres.
+    pub map_sigma_m: f64,
+    /// Never below this per axis, metres.
+    pub floor_m: f64,
+}
+
+/// Zenoh.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ZenohSettings {
+    /// `peer` or `client`.
+    pub mode: String,
+    /// Endpoints to connect to.
+    pub connect: EndpointSettings,
+    /// Endpoints to listen on; none by default.
+    pub listen: EndpointSettings,
+    /// Whether multicast scouting is on.
+    pub multicast: bool,
+    /// A Zenoh configuration file (JSON5) laid under these settings: TLS, access control.
+    pub config_file: Option<PathBuf>,
+}
+
+/// Endpoints.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EndpointSettings {
+    /// For example `tcp/127.0.0.1:7447`.
+    pub endpoints: Vec<String>,
+}
+
+/// The daemon.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DaemonSettings {
+    /// An accepted frame must be answered within this, milliseconds: the watchdog's and the gate `deadline`.
+    pub deadline_ms: u64,
+    /// An attitude further than this from the exposure is unknown, seconds.
+    pub max_attitude_age_s: f64,
+    /// Largest frame payload, bytes.
+    pub max_frame_bytes: usize,
+}

@@ -1,0 +1,1 @@
+//! The service: tokio tasks round one `Localizer`, systemd, health.

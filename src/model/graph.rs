@@ -1,0 +1,4 @@
+//! One ONNX graph in one session.
+
+/// A graph.
+pub struct Graph {}
