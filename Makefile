@@ -37,8 +37,7 @@ venv: $(VENV)/.base ## .venv with the Python packages of demo and tests (no PyTo
 py: $(VENV)/.torch ## .venv with PyTorch and models/ (package sthn), editable.
 
 $(PY):
-	python="$$(scripts/host.sh python $(PYTHON))"
-	"$$python" -m venv $(VENV)
+	python="$$(scripts/host.sh python $(PYTHON))"; "$$python" -m venv $(VENV)
 
 $(VENV)/.base: requirements.txt | $(PY)
 	$(PIP) install --quiet --progress-bar off -r requirements.txt
@@ -76,6 +75,7 @@ test-rust: build ## Rust tests: unit, property, the built binary, real Zenoh ses
 	$(CARGO) test --locked
 
 test-py: py build ## Python tests.
+	$(PY) -m pytest -q demo/tests
 	$(PY) -m pytest -q models/tests
 
 parity: py ## The published network, rebuilt: its recorded numbers, reproduced.
