@@ -6,4 +6,4 @@ mod quad;
 
 pub use dlt::{DltError, Homography, dlt};
 pub use plausibility::{Expected, Implausible, check};
-pub use quad::{Displacement, Quad, box_of_inclusive};
+pub use quad::{Displacement, Quad, box_of_inclusive, displacement_of_box};
