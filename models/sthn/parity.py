@@ -121,7 +121,9 @@ def cases(path: Path) -> Iterator[Path]:
     if path.is_file() or (path / "config.json").is_file():
         yield path
     elif path.is_dir():
-        yield from sorted(inner for inner in path.iterdir() if (inner / "config.json").is_file() or inner.suffix == ".npz")
+        yield from sorted(
+            inner for inner in path.iterdir() if (inner / "config.json").is_file() or inner.match("procedural_*.npz")
+        )
 
 
 def report(path: Path, found: dict[str, float]) -> bool:
