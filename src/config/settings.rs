@@ -1,12 +1,11 @@
-//! The configuration. Every default stands once: in `config/nightfix.toml`, which is compiled in and on which a
-//! user's file is laid. Unknown keys are errors with line and column.
+//! What can be configured. Defaults stand in `config/nightfix.toml`, not here.
 
 use crate::thermal::CameraModel;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
 /// The whole configuration.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Settings {
     /// Vehicle.
@@ -32,7 +31,7 @@ pub struct Settings {
 }
 
 /// Who we are.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct VehicleSettings {
     /// One chunk of the Zenoh key: letters, digits, `-`, `_`.
@@ -40,7 +39,7 @@ pub struct VehicleSettings {
 }
 
 /// Which map.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MapSettings {
     /// GeoTIFF.
@@ -50,7 +49,7 @@ pub struct MapSettings {
 }
 
 /// Which bundle.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BundleSettings {
     /// Folder of the bundle.
@@ -58,7 +57,7 @@ pub struct BundleSettings {
 }
 
 /// ONNX Runtime.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OnnxRuntimeSettings {
     /// Shared library; searched beside the executable where absent.
@@ -70,7 +69,7 @@ pub struct OnnxRuntimeSettings {
 }
 
 /// Priors and tracking.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrackSettings {
     /// Fastest the vehicle moves, metres per second: growth of uncertainty with age.
@@ -86,7 +85,7 @@ pub struct TrackSettings {
 }
 
 /// Gates. `enabled = false` (replay `--gates off`) leaves only what has no answer: reasons up to `non_finite`.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GateSettings {
     /// Whether gates from `implausible_quad` on close.
@@ -114,7 +113,7 @@ pub struct GateSettings {
 }
 
 /// Error budget, 1-sigma.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BudgetSettings {
     /// Attitude error per axis, degrees; times height above ground.
@@ -130,7 +129,7 @@ pub struct BudgetSettings {
 }
 
 /// Zenoh.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ZenohSettings {
     /// `peer` or `client`.
@@ -146,7 +145,7 @@ pub struct ZenohSettings {
 }
 
 /// Endpoints.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EndpointSettings {
     /// For example `tcp/127.0.0.1:7447`.
@@ -154,7 +153,7 @@ pub struct EndpointSettings {
 }
 
 /// The daemon.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DaemonSettings {
     /// An accepted frame must be answered within this, milliseconds: the watchdog's and the gate `deadline`.
