@@ -20,7 +20,8 @@ pub enum Status {
 pub struct FixMessage {
     /// Exposure, Unix UTC nanoseconds.
     pub stamp_ns: i64,
-    /// Counts the messages of this process (of a replay: the rows), from 0.
+    /// Counts the messages from 0: of a replay its rows; of the service its answers, where 0 is what the queryable
+    /// answers before the first frame.
     pub seq: u64,
     /// Fix or not.
     pub status: Status,
@@ -76,6 +77,16 @@ pub struct FixMessage {
     pub prior: Option<PriorEcho>,
     /// Milliseconds by step.
     pub latency_ms: Latency,
+}
+
+/// What the queryable on `fix` answers: the last message and its age.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct LastFixMessage {
+    /// The last message, fix or not; before the first frame a "no fix" with reason `no_prior` and `seq` 0.
+    #[serde(flatten)]
+    pub message: FixMessage,
+    /// Milliseconds since that message was made, by a clock that does not step (before the first frame: since start).
+    pub age_ms: u64,
 }
 
 /// The searched window.

@@ -3,9 +3,13 @@
 mod input;
 mod keys;
 mod message;
+mod schema;
 mod session;
+mod status;
 
-pub use input::{AttitudeMessage, FrameAttachment, InputError, PriorMessage};
+pub use input::{AttitudeMessage, FrameAttachment, InputError, MAX_MESSAGE_BYTES, PriorMessage};
 pub use keys::Keys;
-pub use message::{FixMessage, MapId, PriorEcho, Status, WindowMessage};
-pub use session::{BusError, open};
+pub use message::{FixMessage, LastFixMessage, MapId, PriorEcho, Status, WindowMessage};
+pub use schema::{SCHEMA_NAMES, schema};
+pub use session::{BusError, open, zenoh_config};
+pub use status::{FrameCounts, InputCounts, State, StatusMessage};
