@@ -1,13 +1,11 @@
 //! Recorded flights: the folder layout, replay, metrics, and the simulator with its procedural world.
+//!
+//! Simulator, in the order of its work: [`world`] (an invented land and its picture) -> [`night`] (how that ground
+//! glows) -> [`sensor`] (what a camera over it records).
 
-// mod format;
-// mod metrics;
-// mod replay;
-// mod simulate;
-// mod world;
+pub mod night;
+pub mod noise;
+pub mod sensor;
+pub mod world;
 
-// pub use format::{Flight, FlightError, Row};
-// pub use metrics::{ErrorSummary, Metrics};
-// pub use replay::{ReplayOptions, ReplayReport, replay};
-// pub use simulate::{SimulateOptions, simulate};
-// pub use world::{WorldOptions, make_world};
+pub use world::{World, WorldOptions, make_world};
