@@ -1,9 +1,19 @@
 //! The localizer: a bundle, a map and settings; queries in, answers out.
 
-use super::{Answer, Query};
+use super::gates::{judge_distance, judge_evidence, judge_frame, judge_map, judge_quad, map_valid_share};
+use super::inputs::{FrameView, WindowView};
+use super::pair::{PairError, PairMatch, Search, Steps, match_pair, similarity_of};
+use super::windows::{WindowError, Windows, window_centre};
+use super::{Answer, Evidence, Fix, NoFix, Prior, Query, Reason, StageName, WindowInfo, budget};
 use crate::config::{BudgetSettings, GateSettings};
-use crate::map::MapCache;
-use crate::model::Bundle;
+use crate::geo::LatLon;
+use crate::map::{MapCache, MapError, Window, WindowSpec};
+use crate::model::{Bundle, StageManifest};
+use crate::thermal::{Pose, Rectified, decode, rectify, tone_map};
+use std::sync::Arc;
+
+/// R may exceed D_C by rounding, no more.
+const RADIUS_SLACK: f64 = 1e-6;
 
 /// What can be wrong when a localizer is put together (never while it answers).
 #[derive(Debug, thiserror::Error)]
@@ -20,29 +30,287 @@ pub enum LocateError {
         /// What it says.
         found: String,
     },
+    /// A gate or an error term is not a number that makes sense.
+    #[error("{field}: expected {expected}, found {found}")]
+    Setting {
+        /// Configuration key.
+        field: &'static str,
+        /// What it must be.
+        expected: &'static str,
+        /// What it is.
+        found: f64,
+    },
+    /// The map.
+    #[error(transparent)]
+    Map(#[from] MapError),
+}
+
+/// What was looked at on the way to an answer, for pictures.
+#[derive(Debug, Clone, Default)]
+pub struct Seen {
+    /// The window with its margin, where one was made.
+    pub window: Option<Arc<Window>>,
+    /// The rectified frame, where there is one.
+    pub frame: Option<Rectified>,
 }
 
 /// Answers queries about one map with one bundle.
-pub struct Localizer {}
+pub struct Localizer {
+    bundle: Bundle,
+    windows: Windows,
+    map_centre: LatLon,
+    map_id: (String, String),
+    gates: GateSettings,
+    budget: BudgetSettings,
+}
 
 impl Localizer {
-    /// Puts one together.
+    /// Puts one together. Reads the map once, for its digest.
     pub fn new(bundle: Bundle, map: MapCache, gates: GateSettings, budget: BudgetSettings) -> Result<Self, LocateError> {
-        let _ = (bundle, map, gates, budget);
-        todo!("locate")
+        check_settings(&gates, &budget)?;
+        let map_centre = map.map().centre()?;
+        let map_id = (map.map().name().to_owned(), map.map().digest()?);
+        Ok(Self { bundle, windows: Windows::new(map), map_centre, map_id, gates, budget })
     }
+
     /// Where was the vehicle? Never panics on any frame, pose or prior. `&mut` only for caches: the answer does not
     /// depend on earlier queries.
     pub fn locate(&mut self, query: &Query<'_>) -> Answer {
-        let _ = query;
-        todo!("locate")
+        self.locate_seen(query).0
     }
+
+    /// As [`Localizer::locate`], and what was looked at.
+    pub fn locate_seen(&mut self, query: &Query<'_>) -> (Answer, Seen) {
+        let mut on_the_way = OnTheWay { prior: None, window: None, evidence: Evidence::new(), seen: Seen::default() };
+        let mut steps = Steps::start();
+        let mut total = Steps::start();
+        let outcome = self.answer(query, &mut on_the_way, &mut steps);
+        steps.done("gates");
+        total.done("total");
+        let mut latency_ms = super::Latency::new();
+        for (name, ms) in steps.taken.iter().chain(&total.taken) {
+            *latency_ms.entry((*name).to_owned()).or_insert(0.0) += ms;
+        }
+        let OnTheWay { prior, window, evidence, seen } = on_the_way;
+        (Answer { outcome, prior, window, evidence, latency_ms }, seen)
+    }
+
     /// The bundle.
     pub fn bundle(&self) -> &Bundle {
-        todo!("locate")
+        &self.bundle
     }
+
     /// The map's file name and digest, for messages.
     pub fn map_id(&self) -> (String, String) {
-        todo!("locate")
+        self.map_id.clone()
     }
+
+    /// How many windows were encoded so far: one per window, not one per frame.
+    pub fn map_encodes(&self) -> u64 {
+        self.windows.encodes()
+    }
+
+    /// The gates, in the contract's order.
+    fn answer(&mut self, query: &Query<'_>, way: &mut OnTheWay, steps: &mut Steps) -> Result<Fix, NoFix> {
+        let prior = query.prior.clone()?;
+        way.prior = Some(prior);
+        self.judge_prior(&prior)?;
+        let (frame, pose) = self.read_frame(query, steps)?;
+        let way_frame = way.seen.frame.insert(frame);
+        let view = FrameView { size_px: way_frame.size_px, gray: &way_frame.pixels, seen: &way_frame.valid };
+        self.judge_map_reach(&prior)?;
+        judge_frame(&view, &self.gates, &mut way.evidence)?;
+        steps.done("frame_gates");
+
+        let manifest = &self.bundle.manifest;
+        let (margin_px, frame_px) = (manifest.margin_px(), manifest.frame_px());
+        let slack_m = (manifest.window_width_m - manifest.frame_width_m) / 2.0 - prior.radius_m;
+        let centre = window_centre(self.map_centre, prior.position, slack_m);
+        let width_m = manifest.window_width_m;
+        let spec = WindowSpec { centre, width_m: width_m + 2.0 * manifest.window_margin_m, m_per_px: manifest.m_per_px };
+        let kept = self.windows.get(&spec, &mut self.bundle, steps).map_err(no_window)?;
+        let window = Arc::clone(&kept.window);
+        way.seen.window = Some(Arc::clone(&window));
+        way.window = Some(WindowInfo { centre, width_m, map_affine: inner_affine(&window, margin_px) });
+        steps.done("window");
+
+        let (x, y) = window.to_px(prior.position);
+        let search = Search {
+            centre_px: [x - margin_px as f64, y - margin_px as f64],
+            radius_m: prior.radius_m,
+            vehicle_px: [way_frame.vehicle_px.0, way_frame.vehicle_px.1],
+            yaw_known: query.pose.yaw_deg.is_some(),
+        };
+        let picture = WindowView { size_px: window.size_px, rgb: &window.rgb };
+        let found = match_pair(&mut self.bundle, &picture, &mut kept.map, &view, &search, steps).map_err(no_match)?;
+        way.evidence.extend(found.evidence.iter().map(|(name, value)| (name.clone(), *value)));
+
+        // Eq. (8), of the point under the vehicle.
+        let [x, y] = found.homography.apply(way_frame.vehicle_px.0, way_frame.vehicle_px.1);
+        if !(x.is_finite() && y.is_finite() && x.abs() < 1e6 && y.abs() < 1e6) {
+            return Err(NoFix::new(Reason::NonFinite, format!("place of the vehicle: expected window pixels, found ({x}, {y})")));
+        }
+        let position = window.to_lat_lon(x + margin_px as f64, y + margin_px as f64);
+        let position = LatLon::new(position.lat_deg, position.lon_deg);
+        let position =
+            position.ok_or_else(|| NoFix::new(Reason::NonFinite, "place of the vehicle: expected a position, found none"))?;
+        let map_valid = map_valid_share(&found.homography, frame_px, &window, margin_px);
+        way.evidence.insert("map_valid".into(), map_valid);
+        if self.gates.enabled {
+            judge_quad(&found.quad, manifest_side(&self.bundle), search.yaw_known, &self.gates)?;
+            judge_distance(position.distance_m(prior.position), prior.radius_m)?;
+            judge_map(map_valid, &self.gates)?;
+            judge_evidence(&way.evidence, &self.gates)?;
+        }
+        let agl_m = way_frame.agl_m;
+        Ok(self.fix(position, &found, &pose, agl_m, &mut way.evidence))
+    }
+
+    /// `no_prior` for a prior that is none, `prior_too_wide`.
+    fn judge_prior(&self, prior: &Prior) -> Result<(), NoFix> {
+        if LatLon::new(prior.position.lat_deg, prior.position.lon_deg).is_none() {
+            let detail = format!("prior: expected a position, found ({}, {})", prior.position.lat_deg, prior.position.lon_deg);
+            return Err(NoFix::new(Reason::NoPrior, detail));
+        }
+        let most_m = self.bundle.manifest.search_radius_m;
+        if prior.radius_m.is_nan() || prior.radius_m < 0.0 {
+            return Err(NoFix::new(Reason::NoPrior, format!("prior: expected a radius in metres, found {}", prior.radius_m)));
+        }
+        if prior.radius_m > most_m * (1.0 + RADIUS_SLACK) {
+            let detail = format!("search radius: expected at most {most_m} m (D_C of the bundle), found {:.1} m", prior.radius_m);
+            return Err(NoFix::new(Reason::PriorTooWide, detail));
+        }
+        Ok(())
+    }
+
+    /// Decode, tone mapping, rectification: `bad_frame`. Also the pose that was assumed.
+    fn read_frame(&self, query: &Query<'_>, steps: &mut Steps) -> Result<(Rectified, Pose), NoFix> {
+        let bad = |e: &dyn std::fmt::Display| NoFix::new(Reason::BadFrame, e.to_string());
+        let encoded = query.frame.as_ref().map_err(|e| bad(e))?;
+        let searches_circle = matches!(self.bundle.manifest.coarse, StageManifest::Correlation(_));
+        if query.pose.yaw_deg.is_none() && !searches_circle {
+            return Err(bad(&"yaw_deg: expected a known yaw (this bundle does not search the circle), found none"));
+        }
+        let raw = decode(encoded.bytes, encoded.encoding, encoded.size_px).map_err(|e| bad(&e))?;
+        steps.done("decode");
+        let gray = tone_map(&raw);
+        steps.done("tone");
+        // With an unknown yaw the circle is searched from north up.
+        let pose = Pose { yaw_deg: query.pose.yaw_deg.or(Some(0.0)), ..query.pose };
+        let manifest = &self.bundle.manifest;
+        let frame = rectify(&gray, &pose, manifest.frame_px(), manifest.m_per_px).map_err(|e| bad(&e))?;
+        steps.done("rectify");
+        Ok((frame, pose))
+    }
+
+    /// `off_map`.
+    fn judge_map_reach(&mut self, prior: &Prior) -> Result<(), NoFix> {
+        let side_m = self.bundle.manifest.frame_width_m;
+        let share = self.gates.min_map_valid;
+        let held = self.windows.map.can_hold(prior.position, prior.radius_m, side_m, share);
+        let held = held.map_err(|e| NoFix::new(Reason::OffMap, e.to_string()))?;
+        if held {
+            return Ok(());
+        }
+        let detail = format!(
+            "within {:.0} m of the prior: expected a {side_m} m square at least {share} on valid map, found none",
+            prior.radius_m
+        );
+        Err(NoFix::new(Reason::OffMap, detail))
+    }
+
+    fn fix(&self, position: LatLon, found: &PairMatch, pose: &Pose, agl_m: Option<f64>, evidence: &mut Evidence) -> Fix {
+        let manifest = &self.bundle.manifest;
+        let last = match (&found.stage, &manifest.refine) {
+            (StageName::Refine, Some(refine)) => refine,
+            _ => &manifest.coarse,
+        };
+        let error = budget::stated_error(&self.budget, last.match_sigma_m(), pose, agl_m, evidence);
+        let turn_deg = similarity_of(manifest.frame_px(), &found.quad).rotation_deg;
+        Fix {
+            position,
+            covariance_enu_m2: error.covariance_enu_m2,
+            radius95_m: error.radius95_m,
+            radius999_m: error.radius999_m,
+            calibrated: false,
+            yaw_deg: (pose.yaw_deg.unwrap_or(0.0) + turn_deg).rem_euclid(360.0),
+            scale: area(&found.quad).sqrt() / manifest_side(&self.bundle),
+            stage: found.stage,
+            homography: found.homography.0,
+        }
+    }
+}
+
+/// What is known on the way, whichever gate closes.
+struct OnTheWay {
+    prior: Option<Prior>,
+    window: Option<WindowInfo>,
+    evidence: Evidence,
+    seen: Seen,
+}
+
+fn manifest_side(bundle: &Bundle) -> f64 {
+    bundle.manifest.frame_width_m
+}
+
+/// Shoelace; the order of the corners is TL, TR, BL, BR.
+fn area(quad: &crate::homography::Quad) -> f64 {
+    let [tl, tr, bl, br] = quad.0;
+    let cross = |a: [f64; 2], b: [f64; 2]| a[0] * b[1] - a[1] * b[0];
+    (cross(tl, tr) + cross(tr, br) + cross(br, bl) + cross(bl, tl)).abs() / 2.0
+}
+
+/// The affine of the window without its margin.
+fn inner_affine(window: &Window, margin_px: usize) -> [f64; 6] {
+    let [a, b, c, d, e, f] = window.map_affine;
+    let m = margin_px as f64;
+    [a, b, c + (a + b) * m, d, e, f + (d + e) * m]
+}
+
+fn no_window(error: WindowError) -> NoFix {
+    match error {
+        WindowError::Map(e) => NoFix::new(Reason::OffMap, e.to_string()),
+        WindowError::Pair(e) => no_match(e),
+    }
+}
+
+fn no_match(error: PairError) -> NoFix {
+    let reason = match &error {
+        PairError::YawNeeded { .. } => Reason::BadFrame,
+        PairError::NonFinite { .. } | PairError::Graph(_) => Reason::NonFinite,
+    };
+    NoFix::new(reason, error.to_string())
+}
+
+fn check_settings(gates: &GateSettings, budget: &BudgetSettings) -> Result<(), LocateError> {
+    let shares = [
+        ("gates.min_map_valid", gates.min_map_valid),
+        ("gates.min_frame_valid", gates.min_frame_valid),
+        ("gates.min_side_ratio", gates.min_side_ratio),
+        ("gates.min_peak_mass", gates.min_peak_mass),
+    ];
+    let sizes = [
+        ("gates.min_frame_std", gates.min_frame_std),
+        ("gates.max_scale_error", gates.max_scale_error),
+        ("gates.max_rotation_deg", gates.max_rotation_deg),
+        ("gates.max_second_peak", gates.max_second_peak),
+        ("gates.max_stage_shift_m", gates.max_stage_shift_m),
+        ("gates.max_refine_residual_m", gates.max_refine_residual_m),
+        ("budget.sigma_tilt_deg", budget.sigma_tilt_deg),
+        ("budget.sigma_tilt_unknown_deg", budget.sigma_tilt_unknown_deg),
+        ("budget.assumed_agl_m", budget.assumed_agl_m),
+        ("budget.map_sigma_m", budget.map_sigma_m),
+        ("budget.floor_m", budget.floor_m),
+    ];
+    for (field, found) in shares {
+        if !(0.0..=1.0).contains(&found) {
+            return Err(LocateError::Setting { field, expected: "0 to 1", found });
+        }
+    }
+    for (field, found) in sizes {
+        if !(0.0..=1e6).contains(&found) {
+            return Err(LocateError::Setting { field, expected: "a finite number from 0 on", found });
+        }
+    }
+    Ok(())
 }

@@ -1,11 +1,23 @@
 //! The two-stage pipeline of the paper, in the paper's order, with gates and an error budget.
 //!
-//! One [`Localizer`] answers every caller. It is synchronous, holds no clock and no network.
+//! One [`Localizer`] answers every caller. It is synchronous, holds no clock and no network. [`pair`] is the algorithm;
+//! [`Localizer`] puts map, geodesy, gates and error budget round it.
 
 mod answer;
+mod budget;
+mod correlate;
+mod gates;
+mod hypotheses;
+mod inputs;
 mod localizer;
+pub mod pair;
+mod posterior;
 mod query;
+mod resample;
+mod stages;
+mod windows;
 
 pub use answer::{Answer, Evidence, Fix, Latency, NoFix, Reason, StageName, WindowInfo};
-pub use localizer::{Localizer, LocateError};
+pub use inputs::{FrameView, WindowView};
+pub use localizer::{Localizer, LocateError, Seen};
 pub use query::{EncodedFrame, Prior, PriorSource, Query};

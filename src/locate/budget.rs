@@ -1,0 +1,89 @@
+//! The error budget: what a fix may be off by, term by term. Uncalibrated, and saying so.
+
+use super::Evidence;
+use crate::config::BudgetSettings;
+use crate::thermal::Pose;
+
+/// Quantiles of the squared radius of a two-dimensional standard normal: `-2 ln(1 - p)`.
+const CHI2_095: f64 = 5.991_464_547_107_98;
+const CHI2_0999: f64 = 13.815_510_557_964_27;
+
+/// A fix's stated error.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StatedError {
+    /// East-north, square metres.
+    pub covariance_enu_m2: [[f64; 2]; 2],
+    /// Radius that holds the truth with probability 0.95, metres.
+    pub radius95_m: f64,
+    /// With 0.999.
+    pub radius999_m: f64,
+}
+
+/// covariance = match^2 + (agl x tilt)^2 + map^2 + floor^2 per axis. `match_sigma_m` is the last stage's, from the bundle.
+/// Where pitch or roll are unknown, nadir was assumed and the tilt is `sigma_tilt_unknown_deg`; where the height is
+/// unknown, `assumed_agl_m` stands in. Each term goes into the evidence.
+pub fn stated_error(
+    settings: &BudgetSettings,
+    match_sigma_m: f64,
+    pose: &Pose,
+    agl_m: Option<f64>,
+    evidence: &mut Evidence,
+) -> StatedError {
+    let attitude_known = pose.pitch_deg.is_some() && pose.roll_deg.is_some();
+    let tilt_deg = if attitude_known { settings.sigma_tilt_deg } else { settings.sigma_tilt_unknown_deg };
+    let tilt_m = agl_m.unwrap_or(settings.assumed_agl_m) * tilt_deg.to_radians();
+    let mut variance_m2 = 0.0;
+    for (name, sigma_m) in [
+        ("sigma_match_m", match_sigma_m),
+        ("sigma_tilt_m", tilt_m),
+        ("sigma_map_m", settings.map_sigma_m),
+        ("sigma_floor_m", settings.floor_m),
+    ] {
+        evidence.insert(name.into(), sigma_m);
+        variance_m2 += sigma_m * sigma_m;
+    }
+    let covariance_enu_m2 = [[variance_m2, 0.0], [0.0, variance_m2]];
+    let widest_m2 = largest_eigenvalue(&covariance_enu_m2);
+    StatedError { covariance_enu_m2, radius95_m: (CHI2_095 * widest_m2).sqrt(), radius999_m: (CHI2_0999 * widest_m2).sqrt() }
+}
+
+/// Of a symmetric matrix. With unequal axes the circle of this sigma holds more than its probability, never less.
+fn largest_eigenvalue(m: &[[f64; 2]; 2]) -> f64 {
+    let (mean, half) = ((m[0][0] + m[1][1]) / 2.0, (m[0][0] - m[1][1]) / 2.0);
+    mean + half.hypot(m[0][1])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SETTINGS: BudgetSettings =
+        BudgetSettings { sigma_tilt_deg: 0.5, sigma_tilt_unknown_deg: 2.0, assumed_agl_m: 500.0, map_sigma_m: 1.0, floor_m: 0.5 };
+
+    #[test]
+    fn terms_add_in_squares_and_are_named() {
+        let pose = Pose { pitch_deg: Some(1.0), roll_deg: Some(0.0), ..Pose::default() };
+        let mut evidence = Evidence::new();
+        let error = stated_error(&SETTINGS, 3.0, &pose, Some(100.0), &mut evidence);
+        let tilt = 100.0 * 0.5f64.to_radians();
+        let variance = 9.0 + tilt * tilt + 1.0 + 0.25;
+        assert!((error.covariance_enu_m2[0][0] - variance).abs() < 1e-12 && error.covariance_enu_m2[0][1] == 0.0);
+        assert!((error.radius95_m - (5.991f64 * variance).sqrt()).abs() < 1e-3);
+        assert!((error.radius999_m - (13.816f64 * variance).sqrt()).abs() < 1e-3);
+        assert_eq!(evidence["sigma_match_m"], 3.0);
+        assert_eq!(evidence.len(), 4);
+    }
+
+    #[test]
+    fn what_is_unknown_costs() {
+        let mut evidence = Evidence::new();
+        let half_known = Pose { pitch_deg: Some(0.0), ..Pose::default() };
+        stated_error(&SETTINGS, 1.0, &half_known, None, &mut evidence);
+        assert!((evidence["sigma_tilt_m"] - 500.0 * 2.0f64.to_radians()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn unequal_axes_are_bounded_by_the_longer() {
+        assert!((largest_eigenvalue(&[[5.0, 4.0], [4.0, 5.0]]) - 9.0).abs() < 1e-12);
+    }
+}
