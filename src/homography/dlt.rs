@@ -123,10 +123,8 @@ pub fn dlt(from: &[[f64; 2]], to: &[[f64; 2]]) -> Result<Homography, DltError> {
     // The third coordinate at the origin against that at the middle of the points: where the first vanishes, h[2][2] = 1
     // cannot hold, and a rounding error must not stand in for it.
     let at_middle = normalised.m33;
-    if !(h.m33.abs() > MIN_ORIGIN_RATIO * at_middle.abs()) {
-        return Err(DltError::Degenerate);
-    }
-    Homography::scaled(&h).ok_or(DltError::Degenerate)
+    let near = h.m33.abs() > MIN_ORIGIN_RATIO * at_middle.abs();
+    Homography::scaled(&h).filter(|_| near).ok_or(DltError::Degenerate)
 }
 
 /// `p -> (p - mean) * scale`, so that points have mean 0 and mean distance sqrt 2. H&Z 4.4.4.
@@ -143,7 +141,8 @@ impl Normalisation {
         let scale = std::f64::consts::SQRT_2 / spread;
         // Points that differ by less than their own rounding error are one point; NaN and overflow end here as well.
         let magnitude = mean[0].abs().max(mean[1].abs());
-        if !(spread > 1e-9 * magnitude && scale.is_finite() && scale > 0.0) {
+        let distinct = spread > 1e-9 * magnitude && scale.is_finite() && scale > 0.0;
+        if !distinct {
             return Err(DltError::Degenerate);
         }
         let moved = points.iter().map(|p| [(p[0] - mean[0]) * scale, (p[1] - mean[1]) * scale]).collect();
@@ -192,11 +191,9 @@ fn least_squares(from: &[[f64; 2]], to: &[[f64; 2]]) -> Option<Matrix3<f64>> {
     let mut order: Vec<usize> = (0..svd.singular_values.len()).collect();
     order.sort_by(|&i, &j| svd.singular_values[i].total_cmp(&svd.singular_values[j]));
     let (&least, &next, &largest) = (order.first()?, order.get(1)?, order.last()?);
-    if !(svd.singular_values[next] > MIN_RANK_RATIO * svd.singular_values[largest]) {
-        return None;
-    }
+    let unique = svd.singular_values[next] > MIN_RANK_RATIO * svd.singular_values[largest];
     let h = Matrix3::from_row_iterator(v_t.row(least).iter().copied());
-    (h.determinant().abs() > MIN_DETERMINANT).then_some(h)
+    (unique && h.determinant().abs() > MIN_DETERMINANT).then_some(h)
 }
 
 /// The inverse up to scale.

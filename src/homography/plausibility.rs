@@ -40,17 +40,20 @@ pub fn check(quad: &Quad, expected: &Expected) -> Result<(), Implausible> {
     if !quad.is_convex() {
         return implausible("shape", "convex, TL TR BR BL clockwise".into(), format!("{:.1?}", quad.0));
     }
-    // Each bound is written so that a NaN among the limits closes the gate.
+    // Each test is written so that a NaN among the limits closes the gate.
     let scale = quad.area_px2().sqrt() / expected.side_m;
-    if !((scale - 1.0).abs() <= expected.max_scale_error) {
+    let scale_fits = (scale - 1.0).abs() <= expected.max_scale_error;
+    if !scale_fits {
         return implausible("scale", format!("1 +- {}", expected.max_scale_error), format!("{scale:.4}"));
     }
     let rotation_deg = quad.rotation_deg();
-    if !(rotation_deg.abs() <= expected.max_rotation_deg) {
+    let rotation_fits = rotation_deg.abs() <= expected.max_rotation_deg;
+    if !rotation_fits {
         return implausible("rotation", format!("within {} degrees", expected.max_rotation_deg), format!("{rotation_deg:.2}"));
     }
     for (what, ratio) in ratios(quad) {
-        if !(ratio >= expected.min_side_ratio) {
+        let ratio_fits = ratio >= expected.min_side_ratio;
+        if !ratio_fits {
             return implausible(what, format!("a ratio of at least {}", expected.min_side_ratio), format!("{ratio:.4}"));
         }
     }
