@@ -1,9 +1,12 @@
 //! Frame bytes -> samples. Sizes are bounded before anything is allocated.
 
+use super::pose::field;
 use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits, Rgba};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::io::Cursor;
+use std::path::Path;
+use std::str::FromStr;
 
 /// How a frame's bytes are to be read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -17,6 +20,33 @@ pub enum Encoding {
     Jpeg,
     /// Raw samples, 16 bit little-endian, row-major; width and height come from outside.
     Y16le,
+}
+
+impl Encoding {
+    /// By the file's ending: `.png`, `.tif`, `.tiff`, `.jpg`, `.jpeg`, and `.y16` or `.raw` for raw samples.
+    pub fn of_file(path: &Path) -> Option<Self> {
+        match path.extension()?.to_str()?.to_ascii_lowercase().as_str() {
+            "png" => Some(Self::Png),
+            "tif" | "tiff" => Some(Self::Tiff),
+            "jpg" | "jpeg" => Some(Self::Jpeg),
+            "y16" | "raw" => Some(Self::Y16le),
+            _ => None,
+        }
+    }
+}
+
+impl FromStr for Encoding {
+    type Err = FrameError;
+    /// As in the messages: `png`, `tiff`, `jpeg`, `y16le`.
+    fn from_str(name: &str) -> Result<Self, FrameError> {
+        match name {
+            "png" => Ok(Self::Png),
+            "tiff" => Ok(Self::Tiff),
+            "jpeg" => Ok(Self::Jpeg),
+            "y16le" => Ok(Self::Y16le),
+            _ => Err(field("encoding", "png, tiff, jpeg or y16le".into(), format!("{name:?}"))),
+        }
+    }
 }
 
 /// A frame's samples as the sensor gave them.
@@ -146,10 +176,6 @@ fn check_size(width: u32, height: u32) -> Result<(), FrameError> {
 
 fn same(name: &'static str, stated: u32, found: u32) -> Result<(), FrameError> {
     if stated == found { Ok(()) } else { Err(field(name, format!("{stated} px, as stated"), format!("{found} px in the image"))) }
-}
-
-fn field(field: &'static str, expected: String, found: String) -> FrameError {
-    FrameError::Field { field, expected, found }
 }
 
 fn weighted(rgb: [u32; 3]) -> u32 {

@@ -25,6 +25,22 @@ fn failing_field(result: Result<RawFrame, FrameError>) -> Option<&'static str> {
 }
 
 #[test]
+fn encodings_by_name_and_by_ending() {
+    for (name, file, encoding) in [
+        ("png", "a/b.PNG", Encoding::Png),
+        ("tiff", "b.tif", Encoding::Tiff),
+        ("jpeg", "b.jpg", Encoding::Jpeg),
+        ("y16le", "b.raw", Encoding::Y16le),
+    ] {
+        assert_eq!(name.parse(), Ok(encoding));
+        assert_eq!(serde_json::to_value(encoding).ok(), Some(serde_json::Value::from(name)));
+        assert_eq!(Encoding::of_file(Path::new(file)), Some(encoding));
+    }
+    assert!("PNG".parse::<Encoding>().is_err());
+    assert_eq!(Encoding::of_file(Path::new("png")), None);
+}
+
+#[test]
 fn sixteen_bits_survive_png_tiff_and_raw() -> Result<(), FrameError> {
     let image = ramp16(61, 37);
     let expected = RawFrame { width: 61, height: 37, samples: Samples::U16(image.as_raw().clone()) };
