@@ -1,6 +1,10 @@
 //! A metric window: a square of the map, resampled to ENU axes about its centre.
 
-use crate::geo::LatLon;
+use super::MapError;
+use crate::geo::{Enu, LatLon};
+
+/// Pixels along a window's side.
+const MAX_SIZE_PX: f64 = 8192.0;
 
 /// Which window.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -13,6 +17,28 @@ pub struct WindowSpec {
     pub m_per_px: f64,
 }
 
+impl WindowSpec {
+    /// Side, pixels: `round(width_m / m_per_px)`, if the window can be made at all.
+    pub fn size_px(&self) -> Result<usize, MapError> {
+        let Self { centre, width_m, m_per_px } = *self;
+        let wrong = |field, expected| Err(MapError::Window { width_m, m_per_px, field, expected });
+        if LatLon::new(centre.lat_deg, centre.lon_deg).is_none() {
+            return wrong("centre", "a latitude within 90 and a longitude within 180 degrees");
+        }
+        if !(width_m.is_finite() && m_per_px.is_finite() && width_m > 0.0 && m_per_px > 0.0) {
+            return wrong("size", "two positive numbers");
+        }
+        let size = (width_m / m_per_px).round();
+        if (1.0..=MAX_SIZE_PX).contains(&size) { Ok(size as usize) } else { wrong("pixels", "1 to 8192 a side") }
+    }
+
+    /// Window pixel -> position: ENU offset from the centre, along the geodesic.
+    pub fn to_lat_lon(&self, size_px: usize, x: f64, y: f64) -> LatLon {
+        let middle = (size_px as f64 - 1.0) / 2.0;
+        self.centre.offset(Enu { east_m: (x - middle) * self.m_per_px, north_m: (middle - y) * self.m_per_px })
+    }
+}
+
 /// A window's pixels. x is true east, y is true south, an integer is the centre of a pixel.
 #[derive(Debug, Clone)]
 pub struct Window {
@@ -23,8 +49,10 @@ pub struct Window {
     /// Interleaved RGB, row-major, `size_px * size_px * 3` bytes. 0 where there is no map.
     pub rgb: Vec<u8>,
     /// 1 where the map is valid, 0 where it is nodata, transparent or absent; `size_px * size_px` bytes.
+    /// A pixel is valid where every map pixel that it is made of is.
     pub valid: Vec<u8>,
-    /// Window pixel -> map CRS coordinates, the best affine (least squares over the corners and the middle).
+    /// Window pixel -> map CRS coordinates, the best affine (least squares over the corners and the middle); NaN where the
+    /// window lies outside the area of the map's projection.
     pub map_affine: [f64; 6],
 }
 
@@ -35,12 +63,12 @@ impl Window {
     }
     /// Window pixel -> position: ENU offset from the centre, along the geodesic.
     pub fn to_lat_lon(&self, x: f64, y: f64) -> LatLon {
-        let _ = (x, y);
-        todo!("map")
+        self.spec.to_lat_lon(self.size_px, x, y)
     }
     /// Position -> window pixel.
     pub fn to_px(&self, at: LatLon) -> (f64, f64) {
-        let _ = at;
-        todo!("map")
+        let Enu { east_m, north_m } = self.spec.centre.enu_to(at);
+        let middle = (self.size_px as f64 - 1.0) / 2.0;
+        (middle + east_m / self.spec.m_per_px, middle - north_m / self.spec.m_per_px)
     }
 }
