@@ -28,7 +28,20 @@ def image(side: int) -> NDArray[np.uint8]:
 
 def thermal() -> NDArray[np.uint8]:
     """The frame of `image(1536)`: inverted gray of rows 400..912, columns 700..1212; `[512, 512]`."""
-    cut = image(1536)[400:912, 700:1212].astype(np.float64)
+    return frame_of(image(1536))
+
+
+def blocks(side: int, block: int = 12) -> NDArray[np.uint8]:
+    """The pattern of `image` in blocks: edges to match, and small once deflated. For golden pairs."""
+    small = image(-(-side // block) * 5)[::5, ::5]
+    return np.repeat(np.repeat(small, block, axis=0), block, axis=1)[:side, :side].copy()
+
+
+def frame_of(window: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The inverted gray of a 512 x 512 part of a window of at least that size (rows 400.., columns 700.. of 1536)."""
+    spare = window.shape[0] - 512
+    top, left = spare * 400 // 1024, spare * 700 // 1024
+    cut = window[top : top + 512, left : left + 512].astype(np.float64)
     return np.floor(255 - cut.mean(2)).astype(np.uint8)
 
 

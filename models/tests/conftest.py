@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from sthn import procedural
+from sthn import export, procedural
 from sthn.network import NetworkConfig, Sthn
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,3 +31,12 @@ def small() -> Sthn:
     """A small two-stage network with weights made by formula."""
     torch.manual_seed(0)
     return procedural.network(SMALL)
+
+
+@pytest.fixture(scope="session")
+def published_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bundle of the published architecture at full size, with the weights of the committed parity case. Never committed:
+    it is made here, through the command."""
+    folder = tmp_path_factory.mktemp("bundle") / "published-1536"
+    assert export.main(["--random-weights", "0", "--out", str(folder), "--name", "published-1536"]) == 0
+    return folder

@@ -27,7 +27,8 @@ def square_to_quad(corners: Tensor, side: float) -> Tensor:
     column_u = tr - tl + g[:, None] * tr
     column_v = bl - tl + h[:, None] * bl
     top_rows = torch.stack([column_u / side, column_v / side, tl], dim=2)
-    bottom_row = torch.stack([g / side, h / side, torch.ones_like(g)], dim=1)[:, None, :]
+    # area / area is 1 for every frame: the exporter would fix the batch of a tensor made of ones.
+    bottom_row = torch.stack([g / side, h / side, area / area], dim=1)[:, None, :]
     return torch.cat([top_rows, bottom_row], dim=1)
 
 
@@ -58,7 +59,5 @@ def feature_homography(displacement: Tensor, feature_side: int) -> Tensor:
     """The homography of a displacement (input pixels) on the feature grid, a quarter of the input: corners
     (0, 0) .. (side - 1, side - 1), displacement / 4."""
     last = float(feature_side - 1)
-    zero, one = torch.zeros_like(displacement[:, :1, :1, :1]), torch.full_like(displacement[:, :1, :1, :1], last)
-    x = torch.cat([torch.cat([zero, one], 3)] * 2, 2)
-    y = torch.cat([torch.cat([zero, zero], 3), torch.cat([one, one], 3)], 2)
-    return square_to_quad(torch.cat([x, y], 1) + displacement / 4, last)
+    corners = displacement.new_tensor([[[0.0, last], [0.0, last]], [[0.0, 0.0], [last, last]]])
+    return square_to_quad(corners + displacement / 4, last)
