@@ -1,23 +1,12 @@
 //! Values that a type cannot rule out: ranges, names, endpoints. NaN is in no range.
 
 use super::layers::Source;
-use super::{ConfigError, OnnxRuntimeSettings, Settings};
+use super::{ConfigError, Settings};
 use crate::model::Provider;
 use std::str::FromStr;
 
 /// A contract, not a preference: an own fix as prior is never taken as better than this per axis, metres.
 const MIN_OWN_FIX_SIGMA_M: f64 = 50.0;
-
-/// Execution providers by name.
-const PROVIDERS: [(&str, Provider); 4] =
-    [("cpu", Provider::Cpu), ("cuda", Provider::Cuda), ("tensorrt", Provider::TensorRt), ("xnnpack", Provider::Xnnpack)];
-
-impl OnnxRuntimeSettings {
-    /// The execution provider asked for, if the name is known (checked when a configuration is read).
-    pub fn execution_provider(&self) -> Option<Provider> {
-        PROVIDERS.iter().find(|(name, _)| *name == self.provider).map(|(_, provider)| *provider)
-    }
-}
 
 impl Settings {
     /// Checks every value.
@@ -45,13 +34,9 @@ impl Settings {
             return Err(source.error("vehicle.name", "1 to 64 of the characters A-Z a-z 0-9 - _", format!("`{name}`")));
         }
         whole("map.cache_mib", self.map.cache_mib as u64, 1, 65_536)?;
-        if self.onnxruntime.execution_provider().is_none() {
-            let known = PROVIDERS.map(|(name, _)| name).join(", ");
-            return Err(source.error(
-                "onnxruntime.provider",
-                format!("one of {known}"),
-                format!("`{}`", self.onnxruntime.provider),
-            ));
+        let provider = &self.onnxruntime.provider;
+        if Provider::from_str(provider).is_err() {
+            return Err(source.error("onnxruntime.provider", Provider::NAMES, format!("`{provider}`")));
         }
         whole("onnxruntime.threads", self.onnxruntime.threads as u64, 1, 256)?;
 
@@ -167,14 +152,5 @@ mod tests {
         refuses("zenoh", "listen.endpoints = [\"tcp/127.0.0.1:7447\", \"\"]");
         let error = Settings::from_toml("[zenoh]\nmode = \"client\"\n", Path::new("a.toml")).unwrap_err().to_string();
         assert!(error.contains("zenoh.connect.endpoints: expected at least one"), "{error}");
-    }
-
-    #[test]
-    fn every_provider_name_is_known() {
-        for name in ["cpu", "cuda", "tensorrt", "xnnpack"] {
-            let text = format!("[onnxruntime]\nprovider = \"{name}\"\n");
-            let settings = Settings::from_toml(&text, Path::new("a.toml")).unwrap();
-            assert!(settings.onnxruntime.execution_provider().is_some());
-        }
     }
 }

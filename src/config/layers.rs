@@ -230,6 +230,19 @@ mod tests {
     }
 
     #[test]
+    fn examples_are_valid() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/examples");
+        let files: Vec<PathBuf> = std::fs::read_dir(folder).unwrap().flatten().map(|file| file.path()).collect();
+        let mut examples = 0;
+        for file in files.iter().filter(|file| file.extension().is_some_and(|e| e == "toml")) {
+            let settings = Settings::load(file).unwrap();
+            crate::bus::zenoh_config(&settings.zenoh, 1 << 20).unwrap();
+            examples += 1;
+        }
+        assert_eq!(examples, 2);
+    }
+
+    #[test]
     fn files_that_cannot_be_read_are_named() {
         let folder = tempfile::tempdir().unwrap();
         let missing = folder.path().join("missing.toml");

@@ -1,0 +1,173 @@
+//! The inference thread with a stand-in for the localizer.
+
+use super::*;
+use crate::bus::{MapId, Status};
+use crate::config::Settings;
+use crate::daemon::health::Identity;
+use crate::geo::LatLon;
+use crate::locate::{Fix, PriorSource, StageName};
+use crate::track::{PriorReport, Spread};
+use std::collections::BTreeMap;
+
+const S: i64 = 1_000_000_000;
+
+struct Bench {
+    inbox: Inbox,
+    outbox: Outbox,
+    health: Health,
+}
+
+fn bench(deadline: Duration) -> Bench {
+    let map = MapId { name: "m.tif".into(), digest: "0".into() };
+    let identity = Identity { vehicle: "uav".into(), bundle: "b".into(), map, provider: "cpu".into() };
+    let health = Health::new(identity, deadline);
+    let tracker = Tracker::new(Settings::defaults().unwrap().track);
+    Bench { inbox: Inbox::new(tracker, Attitudes::new(0.2)), outbox: Outbox::new(&health), health }
+}
+
+fn job(stamp_ns: i64) -> Job {
+    let frame = FrameBytes { bytes: vec![1, 2, 3], encoding: Encoding::Png, size_px: (640, 512) };
+    Job { stamp_ns, arrived: Instant::now(), frame: Ok(frame), stated: Pose::default() }
+}
+
+fn prior(stamp_ns: i64) -> PriorReport {
+    let position = LatLon { lat_deg: 25.0, lon_deg: 55.0 };
+    PriorReport { stamp_ns, position, spread: Spread::RadiusM(512.0), fix_seq: None }
+}
+
+/// Finds the vehicle where the prior is.
+fn locate(query: &Query<'_>) -> Answer {
+    let outcome = match (&query.prior, &query.frame) {
+        (Err(no_fix), _) => Err(no_fix.clone()),
+        (_, Err(error)) => Err(NoFix { reason: Reason::BadFrame, detail: error.to_string() }),
+        (Ok(prior), Ok(_)) => Ok(Fix {
+            position: prior.position,
+            covariance_enu_m2: [[4.0, 0.0], [0.0, 4.0]],
+            radius95_m: 5.0,
+            radius999_m: 8.0,
+            calibrated: false,
+            yaw_deg: 0.0,
+            scale: 1.0,
+            stage: StageName::Coarse,
+            homography: [[1.0, 0.0, 512.0], [0.0, 1.0, 512.0], [0.0, 0.0, 1.0]],
+        }),
+    };
+    Answer {
+        outcome,
+        prior: query.prior.as_ref().ok().copied(),
+        window: None,
+        evidence: BTreeMap::new(),
+        latency_ms: BTreeMap::from([("locate".to_owned(), 1.0)]),
+    }
+}
+
+impl Bench {
+    /// Answers the jobs one by one, each made when its turn comes, and gives what was said about each.
+    fn answer(
+        &self,
+        jobs: impl IntoIterator<Item = Job>,
+        deadline: Duration,
+        locate: impl FnMut(&Query<'_>) -> Answer + Send,
+    ) -> Vec<FixMessage> {
+        let camera = CameraModel::default();
+        let mut messages = Vec::new();
+        std::thread::scope(|scope| {
+            scope.spawn(|| answer_frames(&self.inbox, &self.outbox, &self.health, &camera, deadline, locate));
+            for job in jobs {
+                let seq = self.outbox.last().message.seq;
+                assert!(self.inbox.frames.push(job).is_none());
+                let until = Instant::now() + Duration::from_secs(10);
+                while self.outbox.last().message.seq == seq && Instant::now() < until {
+                    std::thread::sleep(Duration::from_millis(1));
+                }
+                messages.push(self.outbox.last().message);
+            }
+            self.inbox.frames.close();
+        });
+        messages
+    }
+}
+
+const LONG: Duration = Duration::from_secs(30);
+
+#[test]
+fn every_frame_gets_one_answer_with_the_next_number() {
+    let bench = bench(LONG);
+    lock(&bench.inbox.tracker).report(prior(100 * S));
+    // A stamp that repeats, and one that lies before the last answered: newest by arrival, so answered all the same.
+    let messages = bench.answer(vec![job(100 * S), job(100 * S), job(99 * S)], LONG, locate);
+    assert_eq!(messages.iter().map(|m| (m.seq, m.stamp_ns)).collect::<Vec<_>>(), [(1, 100 * S), (2, 100 * S), (3, 99 * S)]);
+    assert!(messages.iter().all(|m| m.status == Status::Fix));
+    assert_eq!(messages[0].prior.unwrap().source, PriorSource::External);
+    assert_eq!((messages[1].prior.unwrap().source, messages[1].prior.unwrap().chain), (PriorSource::OwnFix, 1));
+    assert!(messages[0].latency_ms.contains_key("wait"));
+    assert_eq!(bench.health.status().fixes, 3);
+}
+
+#[test]
+fn without_a_prior_there_is_no_fix_and_a_bad_frame_says_so() {
+    let bench = bench(LONG);
+    let bad =
+        |stamp_ns| Job { frame: Err(FrameError::Field { field: "x", expected: "a".into(), found: "b".into() }), ..job(stamp_ns) };
+    let messages = bench.answer(vec![job(S), bad(S)], LONG, locate);
+    assert_eq!(messages.iter().map(|m| m.reason).collect::<Vec<_>>(), [Some(Reason::NoPrior); 2]);
+    let bench = self::bench(LONG);
+    lock(&bench.inbox.tracker).report(prior(S));
+    let messages = bench.answer(vec![bad(S)], LONG, locate);
+    assert_eq!((messages[0].reason, messages[0].lat_deg), (Some(Reason::BadFrame), None));
+}
+
+#[test]
+fn an_answer_after_the_deadline_is_none() {
+    let deadline = Duration::from_secs(1);
+    let bench = bench(deadline);
+    lock(&bench.inbox.tracker).report(prior(S));
+    let mut slow = true;
+    let messages = bench.answer((0..2).map(|_| job(S)), deadline, |query| {
+        if std::mem::take(&mut slow) {
+            std::thread::sleep(Duration::from_millis(1100));
+        }
+        locate(query)
+    });
+    assert_eq!((messages[0].status, messages[0].reason), (Status::NoFix, Some(Reason::Deadline)));
+    assert!(messages[0].lat_deg.is_none() && messages[0].covariance_enu_m2.is_none() && !messages[0].calibrated);
+    assert!(messages[0].prior.is_some(), "what was known is still said");
+    assert_eq!(messages[1].status, Status::Fix);
+    assert_eq!(bench.health.status().no_fix[&Reason::Deadline], 1);
+    assert_eq!(messages[1].prior.unwrap().source, PriorSource::External, "a fix that came too late is no prior");
+}
+
+#[test]
+fn a_frame_that_waited_past_its_deadline_is_not_looked_at() {
+    let deadline = Duration::from_millis(50);
+    let bench = bench(deadline);
+    let old = || Job { arrived: Instant::now().checked_sub(Duration::from_secs(1)).unwrap(), ..job(S) };
+    let messages = bench.answer(vec![old()], deadline, |_| panic!("not to be called"));
+    assert_eq!(messages[0].reason, Some(Reason::NoPrior), "the earlier reason goes first");
+    let bench = self::bench(deadline);
+    lock(&bench.inbox.tracker).report(prior(S));
+    let messages = bench.answer(vec![old()], deadline, |_| panic!("not to be called"));
+    assert_eq!(messages[0].reason, Some(Reason::Deadline));
+}
+
+#[test]
+fn the_pose_comes_from_the_frame_then_from_the_attitude() {
+    let bench = bench(LONG);
+    lock(&bench.inbox.attitudes).push(crate::bus::AttitudeMessage {
+        stamp_ns: S,
+        roll_deg: 1.0,
+        pitch_deg: 2.0,
+        yaw_deg: 30.0,
+        agl_m: Some(400.0),
+    });
+    let stated = Pose { yaw_deg: Some(5.0), hfov_deg: Some(40.0), ..Pose::default() };
+    let seen = Mutex::new(Vec::new());
+    bench.answer(vec![Job { stated, ..job(S) }, job(9 * S)], LONG, |query| {
+        lock(&seen).push(query.pose);
+        locate(query)
+    });
+    let seen = seen.into_inner().unwrap();
+    assert_eq!((seen[0].yaw_deg, seen[0].hfov_deg, seen[0].agl_m), (Some(5.0), Some(40.0), Some(400.0)));
+    assert!((seen[0].pitch_deg.unwrap() - 2.0).abs() < 1e-9);
+    assert_eq!(seen[1], Pose::default(), "too old is unknown");
+}
