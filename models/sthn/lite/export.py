@@ -9,6 +9,7 @@ import argparse
 import io
 import json
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -78,48 +79,114 @@ def load(folder: Path, net: torch.nn.Module) -> torch.nn.Module:
     return net.eval()
 
 
-def export(coarse_dir: Path, refine_dir: Path, out: Path, name: str, accuracy: dict | None, commands: list[str]) -> dict:
-    """Writes the bundle, checked against torch."""
-    torch.manual_seed(0)
-    coarse_net = load(coarse_dir, coarse.CoarseNet((16, 32, 64, 96)))
-    refine_net = load(refine_dir, refine.RefineNet(REFINE.map_px, REFINE.frame_px))
-    map_px = round((WINDOW_M + 2 * MARGIN_M) / COARSE_M_PER_PX)
-    frame_px = round(FRAME_WIDTH_M / COARSE_M_PER_PX)
-    channels = 32
-    # The correlation's map encoder takes any multiple of 16 px: its golden input need not be the whole window.
+@dataclass
+class Exported:
+    """A stage, as its part of the bundle: graphs, manifest table, golden inputs and torch's outputs."""
+
+    graphs: dict[str, bytes]
+    table: dict
+    inputs: dict[str, dict[str, np.ndarray]]
+    outputs: dict[str, dict[str, np.ndarray]]
+
+
+def coarse_stage(folder: Path, picture: np.ndarray, frame: np.ndarray) -> Exported:
+    """The correlation stage."""
+    net = load(folder, coarse.CoarseNet((16, 32, 64, 96)))
+    # The map encoder takes any multiple of 16 px: its golden input need not be the whole window.
     small = 96
+    frame_px = round(FRAME_WIDTH_M / COARSE_M_PER_PX)
+    free = {2: "height", 3: "width"}
+    example = torch.rand(2, 2, frame_px, frame_px)
+    example[:, 1] = 1.0
+    batch = {"frame": {0: "batch"}, "frame_features": {0: "batch"}}
+    graphs = {
+        "coarse_map": to_onnx(
+            coarse.MapSide(net), {"map": torch.rand(1, 3, small, small)}, ["map_features"], {"map": free, "map_features": free}
+        ),
+        "coarse": to_onnx(coarse.FrameSide(net), {"frame": example}, ["frame_features"], batch),
+    }
+    width_m = WINDOW_M + 2 * MARGIN_M
+    table = {
+        "kind": "correlation",
+        "map": input_spec(round(width_m / COARSE_M_PER_PX), width_m, "rgb", "half_pixel_antialias"),
+        "frame": input_spec(frame_px, FRAME_WIDTH_M, "gray_mask", "half_pixel_antialias"),
+        "stride": STRIDE,
+        "rotations_deg": list(ROTATIONS_DEG),
+        "scales": list(SCALES),
+        "subcell_radius": 2,
+        "tolerance": 1e-3,
+        "match_sigma_m": MATCH_SIGMA_M["coarse"],
+    }
+    inputs = {"coarse_map": {"map": picture_input(picture, small)}, "coarse": {"frame": frame_input(frame, frame_px)}}
     with torch.no_grad():
-        coarse_map_in = {"map": torch.rand(1, 3, small, small)}
-        coarse_in = {"frame": torch.rand(2, 2, frame_px, frame_px)}
-        coarse_in["frame"][:, 1] = 1.0
-        refine_map_in = {"map": torch.rand(1, 3, REFINE.map_px, REFINE.map_px)}
-        features = channels, REFINE.map_px // 2, REFINE.map_px // 2
-        refine_in = {"map_features": torch.rand(1, *features), "frame": torch.rand(1, 2, REFINE.frame_px, REFINE.frame_px)}
-        refine_in["frame"][:, 1] = 1.0
-        free = {2: "height", 3: "width"}
-        matcher_out = ["displacement", "residual", "weight", "covariance"]
-        graphs = {
-            "coarse_map": to_onnx(
-                coarse.MapSide(coarse_net), coarse_map_in, ["map_features"], {"map": free, "map_features": free}
-            ),
-            "coarse": to_onnx(
-                coarse.FrameSide(coarse_net),
-                coarse_in,
-                ["frame_features"],
-                {"frame": {0: "batch"}, "frame_features": {0: "batch"}},
-            ),
-            "refine_map": to_onnx(refine.MapSide(refine_net), refine_map_in, ["map_features"], {}),
-            "refine": to_onnx(
-                refine.Matcher(refine_net), refine_in, matcher_out, {n: {0: "batch"} for n in ["frame", *matcher_out]}
-            ),
+        outputs = {
+            "coarse_map": {"map_features": net.encode_map(torch.from_numpy(inputs["coarse_map"]["map"])).numpy()},
+            "coarse": {"frame_features": net.encode_frame(torch.from_numpy(inputs["coarse"]["frame"])).numpy()},
         }
+    return Exported(graphs, table, inputs, outputs)
+
+
+def refine_stage(folder: Path, picture: np.ndarray, frame: np.ndarray) -> Exported:
+    """The matcher stage."""
+    net = load(folder, refine.RefineNet(REFINE.map_px, REFINE.frame_px))
+    named = ["displacement", "residual", "weight", "covariance"]
+    with torch.no_grad():
+        features = net.encode_map(torch.rand(1, 3, REFINE.map_px, REFINE.map_px))
+    example = torch.rand(1, 2, REFINE.frame_px, REFINE.frame_px)
+    example[:, 1] = 1.0
+    graphs = {
+        "refine_map": to_onnx(refine.MapSide(net), {"map": torch.rand(1, 3, REFINE.map_px, REFINE.map_px)}, ["map_features"], {}),
+        "refine": to_onnx(
+            refine.Matcher(net),
+            {"map_features": features, "frame": example},
+            named,
+            {name: {0: "batch"} for name in ["frame", *named]},
+        ),
+    }
+    table = {
+        "kind": "matcher",
+        "map": input_spec(REFINE.map_px, REFINE.map_width_m, "rgb", "supersample"),
+        "frame": input_spec(REFINE.frame_px, FRAME_WIDTH_M, "gray_mask", "half_pixel_antialias"),
+        "lookup": "frame_indexed",
+        "crop": {"shape": "oriented", "padding_m": (REFINE.map_width_m - FRAME_WIDTH_M) / 2},
+        "tolerance_px": 1e-3,
+        "match_sigma_m": MATCH_SIGMA_M["refine"],
+    }
+    inputs = {
+        "refine_map": {"map": picture_input(picture, REFINE.map_px)},
+        "refine": {"frame": frame_input(frame, REFINE.frame_px)},
+    }
+    with torch.no_grad():
+        features = net.encode_map(torch.from_numpy(inputs["refine_map"]["map"]))
+        matched = refine.Matcher(net)(features, torch.from_numpy(inputs["refine"]["frame"]))
+    outputs = {
+        "refine_map": {"map_features": features.numpy()},
+        "refine": {name: value.numpy() for name, value in zip(named, matched, strict=True)},
+    }
+    return Exported(graphs, table, inputs, outputs)
+
+
+def input_spec(size_px: int, width_m: float, content: str, resize: str) -> dict:
+    """An `InputSpec` of the manifest."""
+    return {"size_px": size_px, "width_m": width_m, "content": content, "resize": resize}
+
+
+def export(coarse_dir: Path, refine_dir: Path | None, out: Path, name: str, accuracy: dict | None) -> dict[str, float]:
+    """Writes the bundle, checked against torch; returns the largest difference of every golden output."""
+    torch.manual_seed(0)
+    picture, frame = golden_pair(int(WINDOW_M + 2 * MARGIN_M), int(FRAME_WIDTH_M))
+    stages = {"coarse": coarse_stage(coarse_dir, picture, frame)}
+    if refine_dir:
+        stages["refine"] = refine_stage(refine_dir, picture, frame)
+    graphs = {key: onnx for stage in stages.values() for key, onnx in stage.graphs.items()}
+    trainings = [folder for folder in (coarse_dir, refine_dir) if folder]
     manifest = {
         "schema": 1,
         "name": name,
         "licence": "MIT",
         "provenance": {
-            "description": "Light two-stage network of this project, trained on satellite maps with synthetic thermal frames.",
-            "command": " && ".join(commands),
+            "description": "Light network of this project, trained on satellite maps with synthetic thermal frames.",
+            "command": " && ".join((folder / "command.txt").read_text().strip() for folder in trainings),
             "seed": json.loads((coarse_dir / "training.json").read_text())["seed"],
             "data": [
                 "dubai_t7, dubai_t8_east: CC0 (MBRSC / Humans in the Loop)",
@@ -134,60 +201,28 @@ def export(coarse_dir: Path, refine_dir: Path, out: Path, name: str, accuracy: d
         "search_radius_m": SEARCH_RADIUS_M,
         "tone_mapping": 1,
         "opset": OPSET,
-        "coarse": {
-            "kind": "correlation",
-            "map": {"size_px": map_px, "width_m": WINDOW_M + 2 * MARGIN_M, "content": "rgb", "resize": "half_pixel_antialias"},
-            "frame": {"size_px": frame_px, "width_m": FRAME_WIDTH_M, "content": "gray_mask", "resize": "half_pixel_antialias"},
-            "stride": STRIDE,
-            "rotations_deg": list(ROTATIONS_DEG),
-            "scales": list(SCALES),
-            "subcell_radius": 2,
-            "tolerance": 1e-3,
-            "match_sigma_m": MATCH_SIGMA_M["coarse"],
-        },
-        "refine": {
-            "kind": "matcher",
-            "map": {"size_px": REFINE.map_px, "width_m": REFINE.map_width_m, "content": "rgb", "resize": "supersample"},
-            "frame": {
-                "size_px": REFINE.frame_px,
-                "width_m": FRAME_WIDTH_M,
-                "content": "gray_mask",
-                "resize": "half_pixel_antialias",
-            },
-            "lookup": "frame_indexed",
-            "crop": {"shape": "oriented", "padding_m": (REFINE.map_width_m - FRAME_WIDTH_M) / 2},
-            "tolerance_px": 1e-3,
-            "match_sigma_m": MATCH_SIGMA_M["refine"],
-        },
+        **{key: stage.table for key, stage in stages.items()},
     }
     if accuracy:
         manifest["accuracy"] = accuracy
     draft = in_memory(manifest, graphs)
-    picture, frame = golden_pair(int(WINDOW_M + 2 * MARGIN_M), int(FRAME_WIDTH_M))
     found = correlate.run_coarse(draft, picture, frame)
-    quad, evidence = correlate.run_refine(draft, picture, frame, None, found)
-    final = geometry.displacement_of(map_px, geometry.inclusive_of_edges(quad, COARSE_M_PER_PX, MARGIN_M))
-    homography = geometry.homography_of_edges(int(FRAME_WIDTH_M), quad)
-    print("golden pair:", found.evidence, evidence)
-    # What the graphs are fed in the check: the golden pair's own inputs would be large; noise packs badly, so pictures do.
-    with torch.no_grad():
-        inputs = {
-            "coarse_map": {"map": picture_input(picture, small)},
-            "coarse": {"frame": frame_input(frame, frame_px)},
-            "refine_map": {"map": picture_input(picture, REFINE.map_px)},
-        }
-        outputs = {
-            "coarse_map": {"map_features": coarse_net.encode_map(torch.from_numpy(inputs["coarse_map"]["map"])).numpy()},
-            "coarse": {"frame_features": coarse_net.encode_frame(torch.from_numpy(inputs["coarse"]["frame"])).numpy()},
-            "refine_map": {"map_features": refine_net.encode_map(torch.from_numpy(inputs["refine_map"]["map"])).numpy()},
-        }
-        inputs["refine"] = {"frame": frame_input(frame, REFINE.frame_px)}
-        matched = refine.Matcher(refine_net)(
-            torch.from_numpy(outputs["refine_map"]["map_features"]), torch.from_numpy(inputs["refine"]["frame"])
-        )
-        outputs["refine"] = {name: value.numpy() for name, value in zip(matcher_out, matched, strict=True)}
-    golden = golden_arrays(inputs, outputs)
-    golden |= {"map_rgb": picture, "frame": frame, "final": final, "homography": homography}
+    quad, evidence = found.quad, dict(found.evidence)
+    if refine_dir:
+        quad, more = correlate.run_refine(draft, picture, frame, None, found)
+        evidence |= more
+    print("golden pair:", ", ".join(f"{key} {value:.4g}" for key, value in evidence.items()))
+    golden = golden_arrays(
+        {key: value for stage in stages.values() for key, value in stage.inputs.items()},
+        {key: value for stage in stages.values() for key, value in stage.outputs.items()},
+    )
+    inclusive = geometry.inclusive_of_edges(quad, COARSE_M_PER_PX, MARGIN_M)
+    golden |= {
+        "map_rgb": picture,
+        "frame": frame,
+        "final": geometry.displacement_of(stages["coarse"].table["map"]["size_px"], inclusive),
+        "homography": geometry.homography_of_edges(int(FRAME_WIDTH_M), quad),
+    }
     return write_bundle(out, manifest, graphs, golden)
 
 
@@ -209,14 +244,13 @@ def main() -> None:
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(prog="sthn.lite.export", description=__doc__, formatter_class=raw)
     parser.add_argument("--coarse", type=Path, required=True, help="folder of a coarse training")
-    parser.add_argument("--refine", type=Path, required=True, help="folder of a refine training")
+    parser.add_argument("--refine", type=Path, help="folder of a refine training; none makes a one-stage bundle")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--name")
     parser.add_argument("--accuracy", type=Path, help="JSON of the [accuracy] table, from `sthn.lite.bar`")
     args = parser.parse_args()
     accuracy = json.loads(args.accuracy.read_text()) if args.accuracy else None
-    commands = [(folder / "command.txt").read_text().strip() for folder in (args.coarse, args.refine)]
-    differences = export(args.coarse, args.refine, args.out, args.name or args.out.name, accuracy, commands)
+    differences = export(args.coarse, args.refine, args.out, args.name or args.out.name, accuracy)
     for key, value in differences.items():
         print(f"{key}: largest difference {value:.2e}")
 
