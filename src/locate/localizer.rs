@@ -157,7 +157,7 @@ impl Localizer {
         let map_valid = map_valid_share(&found.homography, frame_px, &window, margin_px);
         way.evidence.insert("map_valid".into(), map_valid);
         if self.gates.enabled {
-            judge_quad(&found.quad, manifest_side(&self.bundle), search.yaw_known, &self.gates)?;
+            judge_quad(&found.quad, self.bundle.manifest.frame_width_m, search.yaw_known, &self.gates)?;
             judge_distance(position.distance_m(prior.position), prior.radius_m)?;
             judge_map(map_valid, &self.gates)?;
             judge_evidence(&way.evidence, &self.gates)?;
@@ -226,15 +226,15 @@ impl Localizer {
             _ => &manifest.coarse,
         };
         let error = budget::stated_error(&self.budget, last.match_sigma_m(), pose, agl_m, evidence);
-        let turn_deg = similarity_of(manifest.frame_px(), &found.quad).rotation_deg;
+        let found_as = similarity_of(manifest.frame_px(), &found.quad);
         Fix {
             position,
             covariance_enu_m2: error.covariance_enu_m2,
             radius95_m: error.radius95_m,
             radius999_m: error.radius999_m,
             calibrated: false,
-            yaw_deg: (pose.yaw_deg.unwrap_or(0.0) + turn_deg).rem_euclid(360.0),
-            scale: area(&found.quad).sqrt() / manifest_side(&self.bundle),
+            yaw_deg: (pose.yaw_deg.unwrap_or(0.0) + found_as.rotation_deg).rem_euclid(360.0),
+            scale: found_as.scale,
             stage: found.stage,
             homography: found.homography.0,
         }
@@ -247,17 +247,6 @@ struct OnTheWay {
     window: Option<WindowInfo>,
     evidence: Evidence,
     seen: Seen,
-}
-
-fn manifest_side(bundle: &Bundle) -> f64 {
-    bundle.manifest.frame_width_m
-}
-
-/// Shoelace; the order of the corners is TL, TR, BL, BR.
-fn area(quad: &crate::homography::Quad) -> f64 {
-    let [tl, tr, bl, br] = quad.0;
-    let cross = |a: [f64; 2], b: [f64; 2]| a[0] * b[1] - a[1] * b[0];
-    (cross(tl, tr) + cross(tr, br) + cross(br, bl) + cross(bl, tl)).abs() / 2.0
 }
 
 /// The affine of the window without its margin.

@@ -8,8 +8,8 @@ use super::correlate::Correlator;
 use super::inputs::{FrameView, WindowView};
 use super::stages::{self, Similarity};
 use super::{Evidence, StageName};
-use crate::homography::{Displacement, Homography, Quad, dlt};
-use crate::model::{Bundle, CropShape, Dim, GraphError, StageManifest, Tensor};
+use crate::homography::{Displacement, Homography, Quad, displacement_of_box};
+use crate::model::{Bundle, CropShape, Dim, GraphError, Manifest, StageManifest, Tensor};
 use std::time::Instant;
 
 /// Why a pair gave nothing.
@@ -49,7 +49,7 @@ pub struct Search {
 
 impl Search {
     /// The whole of D_C about the window's middle with a nadir frame of known yaw: what the golden pair is matched with.
-    pub fn whole(manifest: &crate::model::Manifest) -> Self {
+    pub fn whole(manifest: &Manifest) -> Self {
         let middle = |px: usize| (px as f64 - 1.0) / 2.0;
         let (window, frame) = (middle(manifest.window_px()), middle(manifest.frame_px()));
         Self { centre_px: [window; 2], radius_m: manifest.search_radius_m, vehicle_px: [frame; 2], yaw_known: true }
@@ -154,48 +154,31 @@ pub fn match_pair(
         evidence.insert("stage_shift_m".into(), (after[0] - before[0]).hypot(after[1] - before[1]));
     }
     steps.done("dlt");
-    let final_displacement = displacement_of(&bundle.manifest, &quad);
+    let final_displacement = final_displacement(&bundle.manifest, &quad);
     Ok(PairMatch { coarse, quad, homography, stage, final_displacement, evidence })
 }
 
 /// The homography that takes the frame's edges to a quad's.
 pub(super) fn homography_of(frame_px: usize, quad: &Quad) -> Result<Homography, PairError> {
     let found = |found: String| PairError::NonFinite { what: "corners", found };
-    if let Some(bad) = quad.0.iter().flatten().find(|v| !v.is_finite()) {
-        return Err(found(bad.to_string()));
-    }
-    let homography = dlt(&Quad::edges(frame_px).0, &quad.0).map_err(|e| found(e.to_string()))?;
+    let homography = quad.homography_from(frame_px).map_err(|e| found(e.to_string()))?;
     match homography.0.iter().flatten().find(|v| !v.is_finite()) {
         None => Ok(homography),
         Some(bad) => Err(found(bad.to_string())),
     }
 }
 
-/// A quad of window edges as displacement in pixels of the coarse stage's map input, from the identity corners: the
-/// inverse of [`crate::homography::box_of_inclusive`].
-fn displacement_of(manifest: &crate::model::Manifest, quad: &Quad) -> Displacement {
+/// A quad of window edges as displacement in pixels of the coarse stage's map input, from the identity corners.
+fn final_displacement(manifest: &Manifest, quad: &Quad) -> Displacement {
     let spec = manifest.coarse.map();
-    let alpha = spec.m_per_px();
+    // A correlation's map input starts at the margin's corner.
     let margin_m = if matches!(manifest.coarse, StageManifest::Matcher(_)) { 0.0 } else { manifest.window_margin_m };
-    let mut displacement = Displacement::default();
-    for (i, (corner, identity)) in quad.0.iter().zip(Quad::inclusive(spec.size_px as usize).0).enumerate() {
-        let (bottom, right) = (i / 2, i % 2);
-        displacement[0][bottom][right] = (corner[0] + 0.5 + margin_m) / alpha - right as f64 - identity[0];
-        displacement[1][bottom][right] = (corner[1] + 0.5 + margin_m) / alpha - bottom as f64 - identity[1];
-    }
-    displacement
+    let edges = Quad(quad.0.map(|[x, y]| [x + margin_m, y + margin_m]));
+    displacement_of_box(&edges, spec.size_px as usize, spec.m_per_px())
 }
 
-/// The similarity that fits a quad of the frame's edges best (least squares).
+/// The similarity that a quad of the frame's edges comes closest to: mean of the corners, mean rotation, scale by area.
 pub(super) fn similarity_of(frame_px: usize, quad: &Quad) -> Similarity {
-    let centre = quad.mean();
-    let middle = (frame_px as f64 - 1.0) / 2.0;
-    let (mut real, mut imaginary, mut norm) = (0.0, 0.0, 0.0);
-    for (from, to) in Quad::edges(frame_px).0.iter().zip(&quad.0) {
-        let (a, b) = ([from[0] - middle, from[1] - middle], [to[0] - centre[0], to[1] - centre[1]]);
-        real += a[0] * b[0] + a[1] * b[1];
-        imaginary += a[0] * b[1] - a[1] * b[0];
-        norm += a[0] * a[0] + a[1] * a[1];
-    }
-    Similarity { centre_px: centre, rotation_deg: imaginary.atan2(real).to_degrees(), scale: real.hypot(imaginary) / norm }
+    let scale = quad.area_px2().abs().sqrt() / frame_px as f64;
+    Similarity { centre_px: quad.mean(), rotation_deg: quad.rotation_deg(), scale }
 }

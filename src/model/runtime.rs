@@ -22,9 +22,6 @@ pub enum Provider {
 }
 
 impl Provider {
-    /// The names `onnxruntime.provider` may take.
-    pub const NAMES: &'static str = "cpu, cuda, tensorrt or xnnpack";
-
     /// The name in configuration and messages.
     pub fn name(self) -> &'static str {
         match self {
@@ -33,16 +30,6 @@ impl Provider {
             Self::TensorRt => "tensorrt",
             Self::Xnnpack => "xnnpack",
         }
-    }
-}
-
-impl std::str::FromStr for Provider {
-    type Err = RuntimeError;
-    fn from_str(name: &str) -> Result<Self, RuntimeError> {
-        [Self::Cpu, Self::Cuda, Self::TensorRt, Self::Xnnpack]
-            .into_iter()
-            .find(|p| p.name() == name)
-            .ok_or_else(|| RuntimeError::UnknownProvider { found: name.to_owned() })
     }
 }
 
@@ -70,12 +57,6 @@ pub enum RuntimeError {
         asked: PathBuf,
         /// What is loaded.
         loaded: PathBuf,
-    },
-    /// `onnxruntime.provider` names none that is known.
-    #[error("onnxruntime.provider: expected {}, found `{found}`", Provider::NAMES)]
-    UnknownProvider {
-        /// What it says.
-        found: String,
     },
     /// `onnxruntime.threads` is out of range.
     #[error("onnxruntime.threads: expected 1 to {MAX_THREADS}, found {found}")]
@@ -179,13 +160,15 @@ pub fn find_library(explicit: Option<&Path>, configured: Option<&Path>) -> Resul
     }
     let beside = std::env::current_exe().and_then(|exe| exe.canonicalize()).ok();
     let beside = beside.as_deref().and_then(Path::parent).unwrap_or(Path::new("."));
-    let folders = [beside.to_owned(), beside.join("../lib/nightfix")];
-    if let Some(found) = folders.iter().find_map(|folder| newest_library_in(folder)) {
-        return Ok(found);
-    }
-    let places = folders.map(|folder| format!("{}/libonnxruntime.so*", folder.display()));
-    Err(RuntimeError::NotFound {
-        tried: format!("--onnxruntime (not given), onnxruntime.library (not set), {}", places.join(", ")),
+    find_in(&[beside.to_owned(), beside.join("../lib/nightfix")])
+}
+
+/// The newest library in the first folder that has one.
+fn find_in(folders: &[PathBuf]) -> Result<PathBuf, RuntimeError> {
+    folders.iter().find_map(|folder| newest_library_in(folder)).ok_or_else(|| {
+        let places: Vec<_> = folders.iter().map(|folder| format!("{}/libonnxruntime.so*", folder.display())).collect();
+        let tried = format!("--onnxruntime (not given), onnxruntime.library (not set), {}", places.join(", "));
+        RuntimeError::NotFound { tried }
     })
 }
 
@@ -230,12 +213,16 @@ mod tests {
     }
 
     #[test]
-    fn with_nothing_named_all_places_are_told() {
-        // The test executable has no library beside it.
-        let error = find_library(None, None).unwrap_err().to_string();
+    fn the_first_folder_with_a_library_wins_and_none_tells_all_places() {
+        let (empty, full) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let folders = [empty.path().to_owned(), full.path().join("../lib/nightfix")];
+        let error = find_in(&folders).unwrap_err().to_string();
         for place in ["--onnxruntime", "onnxruntime.library", "libonnxruntime.so*", "../lib/nightfix"] {
             assert!(error.contains(place), "{error}");
         }
+        std::fs::write(full.path().join("libonnxruntime.so.1.30.0"), b"").unwrap();
+        let found = find_in(&[empty.path().to_owned(), full.path().to_owned()]).unwrap();
+        assert_eq!(found, full.path().join("libonnxruntime.so.1.30.0"));
     }
 
     #[test]
@@ -243,13 +230,5 @@ mod tests {
         let file = tempfile::NamedTempFile::new().unwrap();
         let error = Runtime::load(file.path(), Provider::Cpu, 1).unwrap_err().to_string();
         assert!(error.contains("cannot be loaded") || error.contains("already loaded"), "{error}");
-    }
-
-    #[test]
-    fn provider_names_round_trip_and_others_are_refused() {
-        for provider in [Provider::Cpu, Provider::Cuda, Provider::TensorRt, Provider::Xnnpack] {
-            assert_eq!(provider.name().parse::<Provider>().unwrap(), provider);
-        }
-        assert!("CPU".parse::<Provider>().unwrap_err().to_string().contains("cpu, cuda"));
     }
 }

@@ -1,0 +1,5 @@
+//! What several test programs share.
+#![allow(dead_code, missing_docs, reason = "each program uses a part")]
+
+pub mod bundle;
+pub mod onnx;
