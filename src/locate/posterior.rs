@@ -10,14 +10,14 @@
 //! * Rotation and scale: `m_b = max l(b, p)` over p within 1 cell of p* (3 x 3); mean of the hypotheses' rotations and
 //!   scales weighted by softmax of m_b; rotations are averaged as differences from that of b*, wrapped to (-180, 180].
 //! * `M(p) = sum_b P(b, p)`, `N(p)` = sum of M over the (2r + 1)^2 square about p. `peak_mass = N(p*)`;
-//!   `second_peak = max N(p) / N(p*)` over p in the disc more than `max(6, 2r)` cells from p* along x or y (so that both
+//!   `second_peak = max N(p) / N(p*)` over p in the disc more than `max(6, 2 sqrt(2) r)` cells from p* (so that both
 //!   squares are apart); `entropy_bits` of M.
 
 use super::correlate::ShiftRange;
 use super::hypotheses::Hypothesis;
 
-/// Cells round the peak, along x and y, that belong to it.
-const PEAK_CELLS: i64 = 6;
+/// Cells round the peak that belong to it, at least.
+const PEAK_CELLS: f64 = 6.0;
 
 /// What the posterior says.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -103,10 +103,11 @@ impl Surface<'_> {
             square.filter_map(|(px, py)| self.index(px, py)).filter_map(|i| mass.get(i)).sum()
         };
         let peak_mass = near(x, y);
+        let apart = PEAK_CELLS.max(2.0 * std::f64::consts::SQRT_2 * radius as f64);
         let mut second = 0.0f64;
         for (i, _) in in_disc.iter().enumerate().filter(|(_, in_disc)| **in_disc) {
             let (px, py) = ((i % width) as i64, (i / width) as i64);
-            if (px - x).abs().max((py - y).abs()) > PEAK_CELLS.max(2 * radius) {
+            if ((px - x) as f64).hypot((py - y) as f64) > apart {
                 second = second.max(near(px, py));
             }
         }

@@ -303,7 +303,7 @@ pub fn refine_oriented(
         [x + margin, y + margin]
     };
     // Nominal, not times the coarse scale: the rule must not change between frames.
-    let samples = m_per_px.round().clamp(1.0, 16.0) as usize;
+    let samples = m_per_px.round_ties_even().clamp(1.0, 16.0) as usize;
     let crop = sample_grid(&window.sampler(), n, samples, place);
     let quad = refine(bundle, Tensor { shape: vec![1, 3, n, n], data: crop }, frame, m_per_px, evidence, steps)?;
     // Edges in crop px at 1 frame metre, then through the similarity: H = similarity after the fine homography.
