@@ -1,12 +1,12 @@
 //! `nightfix locate`: one frame, one prior, one answer.
 
 use super::{Common, Outcome, UsageError};
-use crate::bus::{FixMessage, MapId};
+use crate::bus::FixMessage;
 use crate::config::Settings;
+use crate::daemon::equip;
 use crate::geo::LatLon;
-use crate::locate::{EncodedFrame, Localizer, Prior, PriorSource, Query, Seen};
-use crate::map::{GeoTiff, MapCache};
-use crate::model::{Bundle, Runtime, StageManifest};
+use crate::locate::{EncodedFrame, Prior, PriorSource, Query, Seen};
+use crate::model::StageManifest;
 use crate::thermal::{Encoding, Pose};
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
@@ -90,7 +90,10 @@ pub fn run(common: &Common, args: Args) -> Result<Outcome, UsageError> {
         return Err(UsageError("--size: expected WxH for a raw frame, found none".into()));
     }
     let bytes = read_frame(&args.frame, settings.daemon.max_frame_bytes as u64)?;
-    let mut localizer = open(common, &args, &settings)?;
+    settings.map.path = Some(args.map.clone());
+    settings.bundle.path = Some(args.bundle.clone());
+    let equipment = equip(&settings, common.onnxruntime.as_deref(), &|_| ()).map_err(|e| usage(&e))?;
+    let mut localizer = equipment.localizer;
 
     let manifest = &localizer.bundle().manifest;
     let searches_circle = matches!(manifest.coarse, StageManifest::Correlation(_));
@@ -116,27 +119,11 @@ pub fn run(common: &Common, args: Args) -> Result<Outcome, UsageError> {
     if let Some(folder) = &args.dump {
         dump(folder, &seen, localizer.bundle().manifest.margin_px())?;
     }
-    let (name, digest) = localizer.map_id();
-    let bundle = &localizer.bundle().manifest.name;
-    let message = FixMessage::new(args.stamp_ns, 0, &answer, bundle, &MapId { name, digest });
+    let message = FixMessage::new(args.stamp_ns, 0, &answer, &localizer.bundle().manifest.name, &equipment.map);
     let text = if args.json { serde_json::to_string(&message).map_err(|e| usage(&e))? } else { for_people(&message) };
     let mut stdout = std::io::stdout().lock();
     writeln!(stdout, "{text}").map_err(|e| usage(&e))?;
     Ok(Outcome::Done)
-}
-
-/// Runtime, bundle and map, put together.
-fn open(common: &Common, args: &Args, settings: &Settings) -> Result<Localizer, UsageError> {
-    let provider = settings.onnxruntime.execution_provider();
-    let provider =
-        provider.ok_or_else(|| UsageError(format!("onnxruntime.provider: unknown `{}`", settings.onnxruntime.provider)))?;
-    let configured = settings.onnxruntime.library.as_deref();
-    let runtime = Runtime::open(common.onnxruntime.as_deref(), configured, provider, settings.onnxruntime.threads);
-    let runtime = runtime.map_err(|e| UsageError::from_error(&e))?;
-    let bundle = Bundle::open(&args.bundle, &runtime).map_err(|e| UsageError::from_error(&e))?;
-    let map = GeoTiff::open(&args.map).map_err(|e| UsageError::from_error(&e))?;
-    let map = MapCache::new(map, settings.map.cache_mib << 20);
-    Localizer::new(bundle, map, settings.gates.clone(), settings.budget.clone()).map_err(|e| UsageError::from_error(&e))
 }
 
 /// The encoding that a file's name tells.

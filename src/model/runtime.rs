@@ -22,6 +22,9 @@ pub enum Provider {
 }
 
 impl Provider {
+    /// The names `onnxruntime.provider` may take.
+    pub const NAMES: &'static str = "cpu, cuda, tensorrt or xnnpack";
+
     /// The name in configuration and messages.
     pub fn name(self) -> &'static str {
         match self {
@@ -30,6 +33,16 @@ impl Provider {
             Self::TensorRt => "tensorrt",
             Self::Xnnpack => "xnnpack",
         }
+    }
+}
+
+impl std::str::FromStr for Provider {
+    type Err = RuntimeError;
+    fn from_str(name: &str) -> Result<Self, RuntimeError> {
+        [Self::Cpu, Self::Cuda, Self::TensorRt, Self::Xnnpack]
+            .into_iter()
+            .find(|p| p.name() == name)
+            .ok_or_else(|| RuntimeError::UnknownProvider { found: name.to_owned() })
     }
 }
 
@@ -57,6 +70,12 @@ pub enum RuntimeError {
         asked: PathBuf,
         /// What is loaded.
         loaded: PathBuf,
+    },
+    /// `onnxruntime.provider` names none that is known.
+    #[error("onnxruntime.provider: expected {}, found `{found}`", Provider::NAMES)]
+    UnknownProvider {
+        /// What it says.
+        found: String,
     },
     /// `onnxruntime.threads` is out of range.
     #[error("onnxruntime.threads: expected 1 to {MAX_THREADS}, found {found}")]
@@ -230,5 +249,13 @@ mod tests {
         let file = tempfile::NamedTempFile::new().unwrap();
         let error = Runtime::load(file.path(), Provider::Cpu, 1).unwrap_err().to_string();
         assert!(error.contains("cannot be loaded") || error.contains("already loaded"), "{error}");
+    }
+
+    #[test]
+    fn provider_names_round_trip_and_others_are_refused() {
+        for provider in [Provider::Cpu, Provider::Cuda, Provider::TensorRt, Provider::Xnnpack] {
+            assert_eq!(provider.name().parse::<Provider>().unwrap(), provider);
+        }
+        assert!("CPU".parse::<Provider>().unwrap_err().to_string().contains("cpu, cuda"));
     }
 }
