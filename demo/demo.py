@@ -58,8 +58,8 @@ def run_binary(binary: Path, *arguments: object) -> None:
 def make_flight(binary: Path, folder: Path, seed: int, frames: int) -> Flight:
     """World, map and recorded flight, all from the seed."""
     run_binary(
-        binary, "simulate", "--world", seed, "--seed", seed, "--out", folder, "--frames", frames,
-        "--prior-radius-m", D_C_M, "--yaw-sigma-deg", 5, "--scale-sigma", 0.05,
+        binary, "simulate", "--world", seed, "--seed", seed, "--out", folder, "--frames", frames, "--trajectory", "lawnmower",
+        "--radius-m", D_C_M, "--yaw-noise-deg", 5, "--scale-noise", 0.05,
     )  # fmt: skip
     return read_flight(folder)
 
