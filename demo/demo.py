@@ -142,7 +142,7 @@ def draw(binary: Path, flight: Flight, answers: list[dict], found: dict, out: Pa
         if name not in ("stamp_ns", "encoding", "width", "height")
         for text in (f"--{name.replace('_', '-')}={value}",)
     ]
-    run_binary(binary, "frame", "--frame", row.path, "--out", rectified, *pose)
+    run_binary(binary, "frame", row.path, "--out", rectified, *pose)
     pictures.overlay(flight, row, answer, cv2.imread(str(rectified), cv2.IMREAD_GRAYSCALE), out / "overlay.jpg")
     say(f"one frame on the map:  {shown(out / 'overlay.jpg')}")
 
