@@ -39,6 +39,11 @@ def main() -> None:
     config.insert_json5("scouting/gossip/enabled", "false")
     config.insert_json5("listen/endpoints", json.dumps([endpoint]))
     with zenoh.open(config) as session:
+        # As whoever sends frames should: by default Zenoh drops what does not fit its queue.
+        block = zenoh.CongestionControl.BLOCK
+        publishers = {
+            key: session.declare_publisher(f"{root}/{key}", congestion_control=block) for key in ("frame", "prior", "attitude")
+        }
         subscribers = [
             session.declare_subscriber(f"{root}/{key}", lambda sample: say(event="sample", **decoded(sample)))
             for key in ("fix", "status")
@@ -52,10 +57,10 @@ def main() -> None:
         for line in sys.stdin:
             order = json.loads(line)
             if order["do"] == "put":
-                session.put(f"{root}/{order['key']}", encoded(order["payload"]))
+                publishers[order["key"]].put(encoded(order["payload"]))
             elif order["do"] == "frame":
                 payload = Path(order["file"]).read_bytes() if "file" in order else bytes(order["bytes"])
-                session.put(f"{root}/frame", payload, attachment=encoded(order["attachment"]))
+                publishers["frame"].put(payload, attachment=encoded(order["attachment"]))
             elif order["do"] == "get":
                 replies = [decoded(reply.ok) for reply in session.get(f"{root}/fix") if reply.ok]
                 say(event="replies", replies=replies)
