@@ -169,7 +169,7 @@ class RefineNet(nn.Module):
         self.map_encoder = Encoder(3, widths, channels, "batch")
         self.frame_encoder = Encoder(2, widths, channels, "group")
         self.heads = nn.ModuleList([Head((2 * level.radius + 1) ** 2) for level in self.levels])
-        self.log_factors = nn.Parameter(torch.full((len(self.levels),), 4.0))
+        self.log_factors = nn.Parameter(torch.full((len(self.levels),), 3.0))
 
     def encode_map(self, image: Tensor) -> Tensor:
         return normalise(self.map_encoder((image - 0.45) * 4.0))

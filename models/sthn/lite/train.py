@@ -102,6 +102,15 @@ def learning_rate(step: int, steps: int, peak: float, warm_up: int = 100) -> flo
     return peak * 0.5 * (1 + math.cos(math.pi * (step - warm_up) / max(1, steps - warm_up)))
 
 
+def start_from(net: torch.nn.Module, weights: Path) -> None:
+    """Encoders of another stage as a start: features that match across the spectra serve at every scale."""
+    found = torch.load(weights, weights_only=True)
+    encoders = {name: value for name, value in found.items() if name.startswith(("map_encoder.", "frame_encoder."))}
+    missing, extra = net.load_state_dict(encoders, strict=False)
+    if extra or any(name.startswith(("map_encoder.", "frame_encoder.")) for name in missing):
+        raise SystemExit(f"{weights}: expected the encoders of this stage, found others ({extra or missing})")
+
+
 def train(args: argparse.Namespace) -> None:
     """Runs, or goes on with, a training."""
     torch.manual_seed(args.seed)
@@ -115,6 +124,9 @@ def train(args: argparse.Namespace) -> None:
     )
     optimiser = torch.optim.AdamW(net.parameters(), lr=args.peak, weight_decay=1e-4)
     step, spent_s = 0, 0.0
+    if args.init and not (args.out / "last.pt").exists():
+        start_from(net, args.init / "weights.pt")
+        average.module.load_state_dict(net.state_dict())
     last = args.out / "last.pt"
     if last.exists():
         kept = torch.load(last, weights_only=True)
@@ -183,7 +195,8 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--maps", type=Path, required=True, help="folder of the training maps")
     parser.add_argument("--worlds", type=Path, help="folder of procedural worlds (GeoTIFF, `nightfix simulate --world`)")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=2600)
+    parser.add_argument("--init", type=Path, help="folder of a training whose encoders are the start")
+    parser.add_argument("--steps", type=int, default=1600)
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--peak", type=float, default=3e-3)
     parser.add_argument("--seed", type=int, default=1)
