@@ -146,3 +146,7 @@ pub fn expose(
     }
     out
 }
+
+#[cfg(test)]
+#[path = "sensor_tests.rs"]
+mod tests;

@@ -192,3 +192,6 @@ fn slow_field(side_m: f32, dice: &mut Dice) -> SlowField {
         1.1 * fbm(x / 1400.0, y / 1400.0, 2, far) + 0.6 * fbm(x / 260.0, y / 260.0, 3, near)
     })
 }
+
+#[cfg(test)]
+mod tests;

@@ -105,3 +105,6 @@ pub fn make_world(options: &WorldOptions) -> World {
     scatter::grain(&mut canvas, options.grain as f32, &mut small);
     World { size_px, m_per_px: options.m_per_px, rgb: canvas.rgb.into_flattened(), classes: canvas.cover }
 }
+
+#[cfg(test)]
+mod tests;
