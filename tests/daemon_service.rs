@@ -1,5 +1,8 @@
 //! `nightfix run` as it is built, with a Python peer in another process and a service manager that listens.
 
+// Helpers stand outside `#[test]` functions, where clippy.toml's allowances for tests do not reach.
+#![allow(clippy::expect_used, clippy::panic, clippy::print_stderr, clippy::unwrap_used)]
+
 mod service;
 
 use serde_json::{Value, json};
