@@ -15,11 +15,12 @@ const BLOCK_PX: usize = 64;
 /// A frame, averaged over blocks of `step x step` pixels, with a border of one pixel that repeats the edge: within half a
 /// pixel outside its outermost centres, interpolation needs no test.
 pub(super) struct Source {
-    pixels: Vec<u8>,
+    /// For each pixel: itself, its right, its lower and its lower right neighbour, so that one look-up finds all four.
+    squares: Vec<[u8; 4]>,
     /// Size without the border.
     width: usize,
     height: usize,
-    /// Frame pixel -> pixel of `pixels`.
+    /// Frame pixel -> pixel of the bordered picture.
     from_frame: Matrix3<f64>,
 }
 
@@ -52,7 +53,16 @@ impl Source {
         let scale = 1.0 / step as f64;
         let shift = |edge: usize| 1.0 - (edge as f64 + (step as f64 - 1.0) / 2.0) * scale;
         let from_frame = Matrix3::new(scale, 0.0, shift(left), 0.0, scale, shift(top), 0.0, 0.0, 1.0);
-        Ok(Self { pixels, width, height, from_frame })
+        let mut squares = vec![[0; 4]; pixels.len() - stride];
+        let lines = pixels.chunks_exact(stride).zip(pixels.chunks_exact(stride).skip(1));
+        for (out, (upper, lower)) in squares.chunks_exact_mut(stride).zip(lines) {
+            for (square, (ab, cd)) in out.iter_mut().zip(upper.windows(2).zip(lower.windows(2))) {
+                if let (&[a, b], &[c, d]) = (ab, cd) {
+                    *square = [a, b, c, d];
+                }
+            }
+        }
+        Ok(Self { squares, width, height, from_frame })
     }
 }
 
@@ -131,7 +141,9 @@ impl Linear {
 /// Fills a part of a row that begins at column `first` and lies wholly on the source.
 fn sample_row(source: &Source, [across, down, depth]: [Linear; 3], first: usize, row: &mut [u8]) {
     let one = (1_u32 << FRACTION_BITS) as f32;
-    let (mut us, mut vs) = ([0_i32; BLOCK_PX], [0_i32; BLOCK_PX]);
+    // Whole numbers as f32: converted once, as a conversion from usize would not vectorise.
+    let ramp: [f32; BLOCK_PX] = std::array::from_fn(|i| i as f32);
+    let (mut us, mut vs) = ([0_u32; BLOCK_PX], [0_u32; BLOCK_PX]);
     for (k, block) in row.chunks_mut(BLOCK_PX).enumerate() {
         let x = (first + k * BLOCK_PX) as f64;
         // Parallel rays (nadir): the depth is one number.
@@ -139,16 +151,16 @@ fn sample_row(source: &Source, [across, down, depth]: [Linear; 3], first: usize,
             let scaled =
                 |linear: Linear| Linear { start: linear.start / depth.start, slope: linear.slope / depth.start }.at_f32(x);
             let ((u, du), (v, dv)) = (scaled(across), scaled(down));
-            for (i, (fixed_u, fixed_v)) in us.iter_mut().zip(&mut vs).enumerate() {
-                *fixed_u = ((u + du * i as f32) * one + 0.5) as i32;
-                *fixed_v = ((v + dv * i as f32) * one + 0.5) as i32;
+            for (&i, (fixed_u, fixed_v)) in ramp.iter().zip(us.iter_mut().zip(&mut vs)) {
+                *fixed_u = rounded((u + du * i) * one);
+                *fixed_v = rounded((v + dv * i) * one);
             }
         } else {
             let ((u, du), (v, dv), (w, dw)) = (across.at_f32(x), down.at_f32(x), depth.at_f32(x));
-            for (i, (fixed_u, fixed_v)) in us.iter_mut().zip(&mut vs).enumerate() {
-                let scale = one / (w + dw * i as f32);
-                *fixed_u = ((u + du * i as f32) * scale + 0.5) as i32;
-                *fixed_v = ((v + dv * i as f32) * scale + 0.5) as i32;
+            for (&i, (fixed_u, fixed_v)) in ramp.iter().zip(us.iter_mut().zip(&mut vs)) {
+                let scale = one / (w + dw * i);
+                *fixed_u = rounded((u + du * i) * scale);
+                *fixed_v = rounded((v + dv * i) * scale);
             }
         }
         for (out, (&u, &v)) in block.iter_mut().zip(us.iter().zip(&vs)) {
@@ -157,24 +169,30 @@ fn sample_row(source: &Source, [across, down, depth]: [Linear; 3], first: usize,
     }
 }
 
+/// The nearest whole number, for 0 ..= 2^22: what is added moves the point so that the mantissa's last bit is worth 1.
+/// A cast would do the same, but does not vectorise on every target.
+#[inline]
+fn rounded(value: f32) -> u32 {
+    const SHIFT: f32 = (1 << 23) as f32;
+    (value + SHIFT).to_bits().wrapping_sub(SHIFT.to_bits())
+}
+
 impl Source {
     /// The value at a position in units of `1 / (1 << FRACTION_BITS)` pixel of the bordered picture; 0 outside it.
     #[inline]
-    fn bilinear(&self, u: i32, v: i32) -> u8 {
-        let stride = self.width + 2;
-        let at = (v >> FRACTION_BITS) as usize * stride + (u >> FRACTION_BITS) as usize;
-        let (Some(&[a, b]), Some(&[c, d])) = (self.pair(at), self.pair(at + stride)) else { return 0 };
+    fn bilinear(&self, u: u32, v: u32) -> u8 {
+        let at = (v >> FRACTION_BITS) as usize * (self.width + 2) + (u >> FRACTION_BITS) as usize;
+        let Some(&[a, b, c, d]) = self.squares.get(at) else { return 0 };
         let mask = (1 << FRACTION_BITS) - 1;
-        let (fu, fv) = ((u & mask) as u32, (v & mask) as u32);
-        let one = 1 << FRACTION_BITS;
-        // Both rows at once: the upper in the low half word, the lower in the high one.
-        let (left, right) = (u32::from(a) | u32::from(c) << 16, u32::from(b) | u32::from(d) << 16);
-        let both = left * (one - fu) + right * fu;
-        (((both & 0xffff) * (one - fv) + (both >> 16) * fv + (1 << (2 * FRACTION_BITS - 1))) >> (2 * FRACTION_BITS)) as u8
-    }
-
-    #[inline]
-    fn pair(&self, at: usize) -> Option<&[u8; 2]> {
-        self.pixels.get(at..)?.first_chunk::<2>()
+        let (fu, fv) = (u & mask, v & mask);
+        // Both rows at once, the upper in the low half word and the lower in the high one. What a difference borrows from its
+        // neighbour comes back with the sum.
+        let left = u32::from_le_bytes([a, 0, c, 0]);
+        let right = u32::from_le_bytes([b, 0, d, 0]);
+        let both = (left << FRACTION_BITS).wrapping_add(right.wrapping_sub(left).wrapping_mul(fu));
+        let (upper, lower) = (both & 0xffff, both >> 16);
+        let half = 1 << (2 * FRACTION_BITS - 1);
+        ((upper << FRACTION_BITS).wrapping_add(lower.wrapping_sub(upper).wrapping_mul(fv)).wrapping_add(half)
+            >> (2 * FRACTION_BITS)) as u8
     }
 }
