@@ -78,8 +78,9 @@ test-py: py build ## Python tests.
 	$(PY) -m pytest -q demo/tests
 	$(PY) -m pytest -q models/tests
 
-parity: py ## The published network, rebuilt: its recorded numbers, reproduced.
+parity: py build ## The published network's recorded numbers, reproduced; the Rust pipeline against the Python one.
 	$(PY) -m sthn.parity models/tests/data
+	$(CARGO) test --locked --test parity -- --ignored --nocapture
 
 replay: build ## The committed flight through the built binary, with thresholds.
 	target/debug/nightfix replay $(FLIGHT) --bundle $(BUNDLE) --out target/replay \

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import onnx
+import onnxruntime
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -118,8 +119,6 @@ def export_matcher(matcher: Matcher, resize_width: int) -> tuple[bytes, bytes]:
 
 def _check_batches(encoder: bytes, graph: bytes, image: Tensor, frames: Tensor, expected: Tensor) -> None:
     """One map, one and two frames: the golden pair alone would not show a graph that is fixed to its example."""
-    import onnxruntime
-
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     sessions = [onnxruntime.InferenceSession(g, options, providers=["CPUExecutionProvider"]) for g in (encoder, graph)]
