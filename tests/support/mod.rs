@@ -2,4 +2,5 @@
 #![allow(dead_code, missing_docs, reason = "each program uses a part")]
 
 pub mod bundle;
+pub mod map;
 pub mod onnx;
