@@ -88,7 +88,9 @@ fn same_pixels(folder: &Path, expected: &Expected, bundle: &mut Bundle) {
     let homography = apart(&corners(found.homography.0), &corners(expected.homography));
     let flat = |d: &[[[f64; 2]; 2]; 2]| d.iter().flatten().flatten().copied().collect::<Vec<_>>();
     let displacement = largest(flat(&found.final_displacement), flat(&expected.final_displacement));
-    println!("same pixels: coarse {coarse:.2e}, quad {quad:.2e}, homography {homography:.2e} window px; final {displacement:.2e} px");
+    println!(
+        "same pixels: coarse {coarse:.2e}, quad {quad:.2e}, homography {homography:.2e} window px; final {displacement:.2e} px"
+    );
     let tolerance = CORNER_TOLERANCE_PX * expected.m_per_px;
     assert!(coarse <= tolerance && quad <= tolerance && homography <= tolerance);
     assert!(displacement <= CORNER_TOLERANCE_PX);
@@ -144,11 +146,5 @@ fn open_gates() -> GateSettings {
 }
 
 fn budget() -> BudgetSettings {
-    BudgetSettings {
-        sigma_tilt_deg: 1.0,
-        sigma_tilt_unknown_deg: 3.0,
-        assumed_agl_m: 120.0,
-        map_sigma_m: 2.0,
-        floor_m: 1.0,
-    }
+    BudgetSettings { sigma_tilt_deg: 1.0, sigma_tilt_unknown_deg: 3.0, assumed_agl_m: 120.0, map_sigma_m: 2.0, floor_m: 1.0 }
 }

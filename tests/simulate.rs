@@ -18,8 +18,20 @@ fn simulate(out: &Path, extra: &[&str]) -> Output {
 }
 
 const NOISY: [&str; 14] = [
-    "--world", "7", "--seed", "3", "--frames", "4", "--radius-m", "300", "--yaw-noise-deg", "5", "--scale-noise", "0.05",
-    "--attitude-noise-deg", "1",
+    "--world",
+    "7",
+    "--seed",
+    "3",
+    "--frames",
+    "4",
+    "--radius-m",
+    "300",
+    "--yaw-noise-deg",
+    "5",
+    "--scale-noise",
+    "0.05",
+    "--attitude-noise-deg",
+    "1",
 ];
 
 #[test]
@@ -30,7 +42,8 @@ fn the_same_seeds_give_the_same_bytes() {
         let done = simulate(out, &NOISY);
         assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     }
-    let files = ["flight.toml", "poses.csv", "truth.csv", "world.tif", "world_classes.tif", "frames/00000.png", "frames/00003.png"];
+    let files =
+        ["flight.toml", "poses.csv", "truth.csv", "world.tif", "world_classes.tif", "frames/00000.png", "frames/00003.png"];
     for file in files {
         let read = |folder: &Path| std::fs::read(folder.join(file)).expect(file);
         assert!(read(&a) == read(&b), "{file} differs");
@@ -75,7 +88,23 @@ fn rows_keep_to_the_errors_that_were_asked_for() {
 #[test]
 fn lanes_cover_the_ground_and_look_along_the_track() {
     let folder = tempfile::tempdir().expect("a folder");
-    let done = simulate(folder.path(), &["--world", "7", "--frames", "9", "--trajectory", "lawnmower", "--lane-m", "200", "--agl-m", "290", "--prior-every", "3"]);
+    let done = simulate(
+        folder.path(),
+        &[
+            "--world",
+            "7",
+            "--frames",
+            "9",
+            "--trajectory",
+            "lawnmower",
+            "--lane-m",
+            "200",
+            "--agl-m",
+            "290",
+            "--prior-every",
+            "3",
+        ],
+    );
     assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     let rows = Flight::open(folder.path()).expect("a flight").rows;
     let given: Vec<bool> = rows.iter().map(|r| r.prior.is_some()).collect();

@@ -89,7 +89,8 @@ pub fn run(common: &Common, args: Args) -> Result<Outcome, UsageError> {
 
 fn prepare(common: &Common, args: &Args, settings: &Settings, flight: &Flight) -> Result<(Localizer, Tracker), UsageError> {
     let bundle = args.bundle.as_ref().or(settings.bundle.path.as_ref());
-    let bundle = bundle.ok_or_else(|| UsageError("replay: expected --bundle or a configuration that names one, found neither".into()))?;
+    let bundle =
+        bundle.ok_or_else(|| UsageError("replay: expected --bundle or a configuration that names one, found neither".into()))?;
     let map = args.map.as_ref().or(flight.map.as_ref());
     let map = map.ok_or_else(|| UsageError("replay: expected --map or a flight that names its map, found neither".into()))?;
     let map = GeoTiff::open(map).map_err(|e| UsageError::from_error(&e))?;

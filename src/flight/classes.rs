@@ -39,7 +39,8 @@ pub fn read(path: &Path, size_px: (u32, u32)) -> Result<Vec<u8>, String> {
 pub fn write(path: &Path, codes: &[u8], width: u32, height: u32, affine: &Affine, crs: &Crs) -> Result<(), String> {
     let file = std::fs::File::create(path).map_err(|e| e.to_string())?;
     let text = |e: tiff::TiffError| e.to_string();
-    let mut encoder = TiffEncoder::new(BufWriter::new(file)).map_err(text)?.with_compression(Compression::Deflate(DeflateLevel::Balanced));
+    let mut encoder =
+        TiffEncoder::new(BufWriter::new(file)).map_err(text)?.with_compression(Compression::Deflate(DeflateLevel::Balanced));
     let mut image = encoder.new_image::<Gray8>(width, height).map_err(text)?;
     let ([a, _, _, _, e, _], (c, f)) = (affine.0, affine.apply(-0.5, -0.5));
     let directory = image.encoder();

@@ -237,8 +237,8 @@ fn read_bounded(file: &Path, limit: u64) -> Result<String, FlightError> {
 
 fn read_header(file: &Path) -> Result<Header, FlightError> {
     let text = read_bounded(file, MAX_TOML_BYTES)?;
-    let header: Header =
-        toml::from_str(&text).map_err(|e| FlightError::Toml { file: file.to_owned(), why: e.to_string().trim_end().to_owned() })?;
+    let header: Header = toml::from_str(&text)
+        .map_err(|e| FlightError::Toml { file: file.to_owned(), why: e.to_string().trim_end().to_owned() })?;
     let key = |key, expected, found: String| Err(FlightError::Key { file: file.to_owned(), key, expected, found });
     if let Some(schema) = header.schema.filter(|s| *s != SCHEMA) {
         return key("schema", "1", schema.to_string());

@@ -103,7 +103,11 @@ impl Tally {
             (!self.errors_m.is_empty()).then(|| over as f64 / self.errors_m.len() as f64)
         };
         let latency = |values: &Vec<f64>| {
-            Some(LatencySummary { median: percentile(values, 0.5)?, p95: percentile(values, 0.95)?, max: percentile(values, 1.0)? })
+            Some(LatencySummary {
+                median: percentile(values, 0.5)?,
+                p95: percentile(values, 0.95)?,
+                max: percentile(values, 1.0)?,
+            })
         };
         Metrics {
             frames: self.frames,

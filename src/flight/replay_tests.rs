@@ -40,7 +40,8 @@ impl Locate for Echo {
 
 /// A flight with these rows; `good.png` is a frame, `torn.png` is none, others are absent.
 fn flight(folder: &Path, rows: &str) -> Flight {
-    let header = "file,stamp_ns,gsd_m,yaw_deg,prior_lat_deg,prior_lon_deg,prior_sigma_m,prior_radius_m,truth_lat_deg,truth_lon_deg";
+    let header =
+        "file,stamp_ns,gsd_m,yaw_deg,prior_lat_deg,prior_lon_deg,prior_sigma_m,prior_radius_m,truth_lat_deg,truth_lon_deg";
     std::fs::write(folder.join("flight.toml"), "").expect("flight.toml");
     std::fs::write(folder.join("poses.csv"), format!("{header}\n{rows}")).expect("poses.csv");
     image::GrayImage::from_fn(8, 8, |x, y| image::Luma([(x * 31 + y * 7) as u8])).save(folder.join("good.png")).expect("a frame");
@@ -64,7 +65,10 @@ fn one_line_per_row_in_order_with_file_and_error() {
     let rows = "good.png,10,1,0,25.2,55.3,,500,25.2,55.3\nabsent.png,20,1,0,25.2,55.3,,500,25.2,55.3\ngood.png,30,1,0,25.2,55.3,,500,,\n";
     let (lines, report) = run(&flight(folder.path(), rows));
     let [first, second, third] = lines.as_slice() else { panic!("three lines, found {}", lines.len()) };
-    assert_eq!((&first["file"], &first["stamp_ns"], &first["seq"], &first["status"]), (&"good.png".into(), &10.into(), &0.into(), &"fix".into()));
+    assert_eq!(
+        (&first["file"], &first["stamp_ns"], &first["seq"], &first["status"]),
+        (&"good.png".into(), &10.into(), &0.into(), &"fix".into())
+    );
     assert!((first["error_m"].as_f64().expect("a number") - 3.0).abs() < 1e-6);
     assert_eq!((&second["file"], &second["reason"], &second["seq"]), (&"absent.png".into(), &"bad_frame".into(), &1.into()));
     assert!(second["error_m"].is_null() && second.get("error_m").is_some() && second.get("lat_deg").is_none());
@@ -99,13 +103,20 @@ fn a_row_s_own_prior_first_then_the_last_fix() {
     let (lines, _) = run(&flight(folder.path(), rows));
     let [none, own_row, chained, sigma, widthless] = lines.as_slice() else { panic!("five lines") };
     assert_eq!(none["reason"], "no_prior");
-    assert_eq!((&own_row["prior"]["source"], &own_row["prior"]["radius_m"], &own_row["prior"]["chain"]), (&"external".into(), &500.0.into(), &0.into()));
+    assert_eq!(
+        (&own_row["prior"]["source"], &own_row["prior"]["radius_m"], &own_row["prior"]["chain"]),
+        (&"external".into(), &500.0.into(), &0.into())
+    );
     // The last fix, 3 m east of the prior: at least 50 m per axis, grown by a second at 25 m/s.
     assert_eq!((&chained["prior"]["source"], &chained["prior"]["chain"]), (&"own_fix".into(), &1.into()));
     assert_eq!((&chained["prior"]["sigma_m"], &chained["prior"]["radius_m"]), (&75.0.into(), &225.0.into()));
-    let at = LatLon { lat_deg: chained["prior"]["lat_deg"].as_f64().unwrap(), lon_deg: chained["prior"]["lon_deg"].as_f64().unwrap() };
+    let at =
+        LatLon { lat_deg: chained["prior"]["lat_deg"].as_f64().unwrap(), lon_deg: chained["prior"]["lon_deg"].as_f64().unwrap() };
     assert!((at.distance_m(HOME) - 3.0).abs() < 1e-6);
-    assert_eq!((&sigma["prior"]["sigma_m"], &sigma["prior"]["radius_m"], &sigma["prior"]["source"]), (&40.0.into(), &120.0.into(), &"external".into()));
+    assert_eq!(
+        (&sigma["prior"]["sigma_m"], &sigma["prior"]["radius_m"], &sigma["prior"]["source"]),
+        (&40.0.into(), &120.0.into(), &"external".into())
+    );
     assert_eq!(widthless["reason"], "no_prior");
 }
 

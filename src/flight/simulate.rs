@@ -3,12 +3,12 @@
 //! Beside the contract's files it writes `truth.csv`: per frame the true pose, the share of water under it, and the
 //! homography from frame pixels to ground metres. Nothing of it is read by replay.
 
+use super::classes;
 use super::night::{self, Scene};
 use super::noise::Dice;
 use super::sensor::{Faults, Sensor, View, expose};
 use super::trajectory::{Heading, Trajectory, Waypoint, lawnmower, line};
 use super::world::{WorldOptions, make_world};
-use super::classes;
 use crate::geo::{Affine, Crs, Enu, LatLon};
 use crate::map::{GeoTiff, MapCache, WindowSpec, write_rgb};
 use std::fmt::Write as _;
@@ -148,7 +148,9 @@ pub fn simulate(options: &SimulateOptions, mut progress: impl FnMut(usize, usize
     let mut exposure = Dice::new(options.seed, 201);
     let mut faults = Faults::draw(&options.sensor, &mut exposure);
     let way = ground.way(options, &mut dice)?;
-    let mut poses = String::from("file,stamp_ns,agl_m,gsd_m,yaw_deg,pitch_deg,roll_deg,prior_lat_deg,prior_lon_deg,prior_radius_m,truth_lat_deg,truth_lon_deg,truth_yaw_deg\n");
+    let mut poses = String::from(
+        "file,stamp_ns,agl_m,gsd_m,yaw_deg,pitch_deg,roll_deg,prior_lat_deg,prior_lon_deg,prior_radius_m,truth_lat_deg,truth_lon_deg,truth_yaw_deg\n",
+    );
     let mut truth = String::from("file,water_share,agl_m,gsd_m,yaw_deg,pitch_deg,roll_deg,h00,h01,h02,h10,h11,h12,h20,h21,h22\n");
     let mut mostly_water = 0;
     for (i, stop) in way.iter().enumerate() {
@@ -187,7 +189,14 @@ pub fn simulate(options: &SimulateOptions, mut progress: impl FnMut(usize, usize
         );
         let water_share = ground.water_share(waypoint, view.yaw_deg);
         mostly_water += usize::from(water_share > 0.6);
-        let h = options.sensor.ground_homography(view).as_flattened().iter().map(|v| format!("{v:.9e}")).collect::<Vec<_>>().join(",");
+        let h = options
+            .sensor
+            .ground_homography(view)
+            .as_flattened()
+            .iter()
+            .map(|v| format!("{v:.9e}"))
+            .collect::<Vec<_>>()
+            .join(",");
         let _ = writeln!(
             truth,
             "{file},{water_share:.4},{:.3},{gsd_m:.6},{:.4},{:.4},{:.4},{h}",
@@ -211,7 +220,8 @@ pub fn simulate(options: &SimulateOptions, mut progress: impl FnMut(usize, usize
 /// Refuses options that cannot be meant.
 fn check(o: &SimulateOptions) -> Result<(), SimulateError> {
     let refuse = |option, expected: &str, found: String| Err(SimulateError::Option { option, expected: expected.into(), found });
-    let positive = [("agl-m", o.agl_m), ("speed-mps", o.speed_mps), ("lane-m", o.lane_m), ("area-m", o.area_m), ("radius-m", o.radius_m)];
+    let positive =
+        [("agl-m", o.agl_m), ("speed-mps", o.speed_mps), ("lane-m", o.lane_m), ("area-m", o.area_m), ("radius-m", o.radius_m)];
     for (option, value) in positive {
         if !(value.is_finite() && value > 0.0) {
             return refuse(option, "a positive number", value.to_string());
@@ -357,7 +367,8 @@ impl Ground {
                     Heading::North => 0.0,
                 };
                 let sigma = options.attitude_noise_deg;
-                let view = View { agl_m: options.agl_m, yaw_deg, pitch_deg: sigma * dice.normal(), roll_deg: sigma * dice.normal() };
+                let view =
+                    View { agl_m: options.agl_m, yaw_deg, pitch_deg: sigma * dice.normal(), roll_deg: sigma * dice.normal() };
                 self.holds(&waypoint, &view, &options.sensor).then_some(Stop { waypoint, view })
             });
             stops.push(stop.ok_or(SimulateError::NoPlace { frame, width_m, height_m })?);
@@ -371,7 +382,8 @@ impl Ground {
         let m = self.window.m_per_px;
         (0..=8).all(|i| {
             (0..=8).all(|j| {
-                let (u, v) = (f64::from(i) / 8.0 * (sensor.width as f64 - 1.0), f64::from(j) / 8.0 * (sensor.height as f64 - 1.0));
+                let (u, v) =
+                    (f64::from(i) / 8.0 * (sensor.width as f64 - 1.0), f64::from(j) / 8.0 * (sensor.height as f64 - 1.0));
                 let [e, n, w] = h.map(|[a, b, c]| a * u + b * v + c);
                 w > 0.0 && self.at(&self.scene.valid, waypoint.x + e / w / m, waypoint.y - n / w / m) == Some(1)
             })

@@ -20,6 +20,10 @@ pub(super) fn can_hold(
     footprint_m: f64,
     share: f64,
 ) -> Result<bool, MapError> {
+    // Nearly always the middle itself will do.
+    if radius_m > 0.0 && can_hold(map, tiles, centre, 0.0, footprint_m, share)? {
+        return Ok(true);
+    }
     let width_m = 2.0 * radius_m.max(0.0) + footprint_m;
     let step_m = (footprint_m / PROBES_PER_FOOTPRINT).max(width_m / MAX_PROBES);
     let spec = WindowSpec { centre, width_m, m_per_px: step_m };

@@ -50,10 +50,18 @@ impl ChunkReader {
         if level.bits == 16 && self.depth.is_none() {
             self.depth = Some(Depth::observe(map, |l, c| self.samples(map, l, c))?);
         }
-        let (width, height, samples) = self.samples(map, level_index, chunk)?;
-        let mut pixels = match &self.depth {
-            None => to_pixels(level, map.nodata(), &samples, |s| s as u8),
-            Some(depth) => to_pixels(level, map.nodata(), &samples, |s| depth.to_8_bit(s)),
+        let (width, height) = chunk_size(level, chunk);
+        let mut pixels = if is_plain_rgb(level, map.nodata()) {
+            let decoder = self.decoder(map, level_index).map_err(failed)?;
+            let (raw, row_bytes) = raw_chunk(map, level, decoder, chunk).map_err(failed)?;
+            let DecodingResult::U8(bytes) = raw else { return Err(failed("samples that are not bytes".into())) };
+            plain_rgb(level, &bytes, row_bytes, width)
+        } else {
+            let samples = self.samples(map, level_index, chunk)?;
+            match &self.depth {
+                None => to_pixels(level, map.nodata(), &samples, |s| s as u8),
+                Some(depth) => to_pixels(level, map.nodata(), &samples, |s| depth.to_8_bit(s)),
+            }
         };
         if pixels.len() != width * height {
             return Err(failed(format!("{} pixels instead of {width} x {height}", pixels.len())));
@@ -64,16 +72,20 @@ impl ChunkReader {
         Ok(Some(Tile { width, pixels }))
     }
 
-    /// Width, height and pixel-interleaved samples of a chunk, as the file has them.
-    fn samples(&mut self, map: &GeoTiff, level_index: usize, chunk: u32) -> Result<(usize, usize, Vec<u16>), MapError> {
+    /// The decoder of a resolution, opened on first use.
+    fn decoder(&mut self, map: &GeoTiff, level_index: usize) -> Result<&mut TiffDecoder, String> {
+        match (map.levels().get(level_index), self.decoders.get_mut(level_index)) {
+            (_, Some(Some(decoder))) => Ok(decoder),
+            (Some(level), Some(slot)) => Ok(slot.insert(open_decoder(map, level)?)),
+            _ => Err("no such overview".into()),
+        }
+    }
+
+    /// The samples of a chunk, pixel-interleaved, as the file has them.
+    fn samples(&mut self, map: &GeoTiff, level_index: usize, chunk: u32) -> Result<Vec<u16>, MapError> {
         let failed = |found: String| MapError::Decode { path: map.path().to_owned(), level: level_index, chunk, found };
-        let (Some(level), Some(slot)) = (map.levels().get(level_index), self.decoders.get_mut(level_index)) else {
-            return Err(failed("no such overview".into()));
-        };
-        let decoder = match slot {
-            Some(decoder) => decoder,
-            None => slot.insert(open_decoder(map, level).map_err(failed)?),
-        };
+        let decoder = self.decoder(map, level_index).map_err(failed)?;
+        let Some(level) = map.levels().get(level_index) else { return Err(failed("no such overview".into())) };
         let (width, height) = chunk_size(level, chunk);
         let planes = if level.planar { level.bands } else { 1 };
         let mut samples = vec![0_u16; width * height * level.bands];
@@ -95,7 +107,7 @@ impl ChunkReader {
                 return Err(failed(format!("{filled} samples instead of {count}")));
             }
         }
-        Ok((width, height, samples))
+        Ok(samples)
     }
 
     /// Clears the pixels that the mask directory excludes.
@@ -219,6 +231,26 @@ fn guarded<T>(decode: impl FnOnce() -> Result<T, String>) -> Result<T, String> {
     catch_unwind(AssertUnwindSafe(decode)).unwrap_or_else(|_| Err("a file on which the decoder gave up".into()))
 }
 
+/// Whether a level is what most maps are: three interleaved bytes per pixel, all of them valid.
+fn is_plain_rgb(level: &Level, nodata: Option<u32>) -> bool {
+    let three_bytes = level.bits == 8 && level.bands == 3 && !level.planar && level.alpha.is_none();
+    three_bytes && nodata.is_none() && matches!(level.colour, Colour::Rgb | Colour::YCbCr)
+}
+
+/// Pixels of such a level, by the short way.
+fn plain_rgb(level: &Level, bytes: &[u8], row_bytes: usize, width: usize) -> Vec<u32> {
+    let pixels = bytes.chunks(row_bytes).flat_map(|row| row.as_chunks::<3>().0.iter().take(width));
+    match level.colour {
+        Colour::YCbCr => pixels.map(|&[y, cb, cr]| opaque(ycbcr_to_rgb(y, cb, cr))).collect(),
+        _ => pixels.map(|&rgb| opaque(rgb)).collect(),
+    }
+}
+
+/// A valid pixel.
+fn opaque([r, g, b]: [u8; 3]) -> u32 {
+    u32::from_le_bytes([r, g, b, 255])
+}
+
 /// Samples of one chunk to packed pixels.
 fn to_pixels(level: &Level, nodata: Option<u32>, samples: &[u16], to_8_bit: impl Fn(u16) -> u8) -> Vec<u32> {
     let alpha = level.alpha;
@@ -238,7 +270,7 @@ fn to_pixels(level: &Level, nodata: Option<u32>, samples: &[u16], to_8_bit: impl
             Colour::YCbCr => ycbcr_to_rgb(byte(0), byte(1), byte(2)),
             Colour::Palette(colours) => bands.first().and_then(|&i| colours.get(usize::from(i))).copied().unwrap_or_default(),
         };
-        u32::from_le_bytes([rgb[0], rgb[1], rgb[2], 255])
+        opaque(rgb)
     };
     samples.chunks_exact(level.bands).map(pixel).collect()
 }

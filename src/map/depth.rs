@@ -15,11 +15,8 @@ const WHITE_SHARE: f64 = 0.995;
 pub(super) struct Depth(Vec<u8>);
 
 impl Depth {
-    /// Settles the rule. `samples` gives width, height and interleaved samples of a chunk.
-    pub fn observe(
-        map: &GeoTiff,
-        mut samples: impl FnMut(usize, u32) -> Result<(usize, usize, Vec<u16>), MapError>,
-    ) -> Result<Self, MapError> {
+    /// Settles the rule. `samples` gives the interleaved samples of a chunk.
+    pub fn observe(map: &GeoTiff, mut samples: impl FnMut(usize, u32) -> Result<Vec<u16>, MapError>) -> Result<Self, MapError> {
         let coarsest = map.levels().len().saturating_sub(1);
         let mut counts = vec![0_u64; 1 << 16];
         if let Some(level) = map.levels().get(coarsest) {
@@ -28,7 +25,7 @@ impl Depth {
             for i in 0..PROBED_CHUNKS.min(written.len() as u32) {
                 let pick = u64::from(i) * written.len() as u64 / u64::from(PROBED_CHUNKS.min(written.len() as u32));
                 let Some(&chunk) = written.get(pick as usize) else { continue };
-                let (_, _, values) = samples(coarsest, chunk)?;
+                let values = samples(coarsest, chunk)?;
                 let valid = values.chunks_exact(level.bands).flat_map(|p| p.iter().take(colours));
                 for &value in valid.filter(|&&v| map.nodata() != Some(u32::from(v))) {
                     if let Some(count) = counts.get_mut(usize::from(value)) {

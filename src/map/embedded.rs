@@ -2,6 +2,16 @@
 
 /// Fails unless the frame header of a JPEG stream states a size within a chunk's.
 pub(super) fn check_jpeg(bytes: &[u8], (width, height): (u32, u32)) -> Result<(), String> {
+    match jpeg_size(bytes)? {
+        // Encoders may round strips up to whole blocks.
+        Some((w, h)) if w <= width.next_multiple_of(16) && h <= height.next_multiple_of(16) => Ok(()),
+        Some((w, h)) => Err(format!("a JPEG of {w} x {h} px in a chunk of {width} x {height}")),
+        None => Err("a JPEG without a frame header".into()),
+    }
+}
+
+/// Width and height in the frame header of a JPEG stream; `None` where there is none before the data or the end (tables).
+pub(super) fn jpeg_size(bytes: &[u8]) -> Result<Option<(u32, u32)>, String> {
     let be16 = |at: usize| -> Option<u32> { Some(u32::from(u16::from_be_bytes([*bytes.get(at)?, *bytes.get(at + 1)?]))) };
     let mut at = 2;
     while let Some(&[first, marker]) = bytes.get(at..at + 2).and_then(|s| s.first_chunk::<2>()) {
@@ -10,19 +20,15 @@ pub(super) fn check_jpeg(bytes: &[u8], (width, height): (u32, u32)) -> Result<()
             (0xff, 0xff) => at += 1,
             (0xff, 0x01 | 0xd0..=0xd8) => at += 2,
             (0xff, 0xc0..=0xc3 | 0xc5..=0xc7 | 0xc9..=0xcb | 0xcd..=0xcf) => {
-                return match (be16(at + 5), be16(at + 7)) {
-                    // Encoders may round strips up to whole blocks.
-                    (Some(h), Some(w)) if w <= width.next_multiple_of(16) && h <= height.next_multiple_of(16) => Ok(()),
-                    (Some(h), Some(w)) => Err(format!("a JPEG of {w} x {h} px in a chunk of {width} x {height}")),
-                    _ => Err("a JPEG that ends in its header".into()),
-                };
+                let size = be16(at + 7).zip(be16(at + 5));
+                return size.map(Some).ok_or_else(|| "a JPEG that ends in its header".into());
             }
             (0xff, 0xd9 | 0xda) => break,
             (0xff, _) => at += 2 + be16(at + 2).ok_or("a JPEG that ends in its header")? as usize,
             _ => break,
         }
     }
-    Err("a JPEG without a frame header".into())
+    Ok(None)
 }
 
 /// Fails unless a WebP stream states a size within a chunk's.

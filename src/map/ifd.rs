@@ -169,6 +169,11 @@ impl Structure {
         Ok(Some(bytes.chunks_exact(8).map(|c| f64::from_bits(self.number(Some(c)))).collect()))
     }
 
+    /// Bytes of a tag of undefined type; `None` where it is absent.
+    pub fn opaque(&self, source: &Source, directory: &Directory, tag: (u16, &'static str)) -> Result<Option<Vec<u8>>, Flaw> {
+        Ok(self.raw(source, directory, tag, &[1, 7])?.map(|(_, bytes)| bytes))
+    }
+
     /// Text of a tag up to its first NUL; `None` where it is absent.
     pub fn text(&self, source: &Source, directory: &Directory, tag: (u16, &'static str)) -> Result<Option<String>, Flaw> {
         let Some((_, bytes)) = self.raw(source, directory, tag, &[2])? else { return Ok(None) };

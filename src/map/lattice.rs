@@ -47,7 +47,7 @@ impl Lattice {
 
     fn fill(&mut self, exact: &Mapping, spacing: usize, size_px: usize) {
         self.spacing = spacing;
-        self.across = (size_px - 1).div_ceil(spacing).max(1) + 1;
+        self.across = (size_px - 1) / spacing + 2;
         let at = |i: usize| (i * spacing) as f64;
         self.nodes = (0..self.across * self.across).map(|i| exact.map_px(at(i % self.across), at(i / self.across))).collect();
     }
@@ -140,5 +140,50 @@ impl<'a> Mapping<'a> {
         };
         let ([a, b, c], [d, e, f]) = (fit(0), fit(1));
         [a, b, c, d, e, f]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geo::{Affine, Crs, Enu};
+    use crate::map::write_rgb;
+
+    /// A map of one grey pixel's worth of content, somewhere.
+    fn map(code: u32, affine: [f64; 6]) -> (tempfile::TempDir, GeoTiff) {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("map.tif");
+        write_rgb(&path, &[7; 3 * 32 * 32], 32, 32, &Affine(affine), &Crs::from_epsg(code).unwrap()).unwrap();
+        let map = GeoTiff::open(&path).unwrap();
+        (dir, map)
+    }
+
+    #[test]
+    fn between_nodes_the_mapping_is_true_to_a_fiftieth_of_a_pixel() {
+        for (code, affine) in [
+            (32640, [1.0, 0.0, 344_000.5, 0.0, -1.0, 2_790_000.5]),
+            (32633, [1.0, 0.0, 833_000.0, 0.0, -1.0, 6_660_000.0]),
+            (3857, [1.2, 0.0, -13_610_655.0, 0.0, -1.2, 4_561_810.0]),
+            (3857, [2.0, 0.0, 2_700_000.0, 0.0, -2.0, 11_000_000.0]),
+            (4326, [1e-5, 0.0, 55.45, 0.0, -9e-6, 25.21]),
+            (4326, [2.6e-5, 0.0, 20.0, 0.0, -9e-6, 70.0]),
+            (3413, [1.0, 0.0, 40_000.0, 0.0, -1.0, -90_000.0]),
+            (32640, [0.3, 0.4, 344_000.5, 0.4, -0.3, 2_790_000.5]),
+        ] {
+            let (_dir, map) = map(code, affine);
+            for (size_px, m_per_px) in [(1536, 1.0), (1728, 1.0), (256, 6.0), (3072, 0.5), (1, 1.0), (129, 3.0)] {
+                let centre = map.centre().unwrap().offset(Enu { east_m: 300.0, north_m: -200.0 });
+                let spec = WindowSpec { centre, width_m: size_px as f64 * m_per_px, m_per_px };
+                let lattice = Lattice::new(&map, &spec, size_px);
+                let exact = Mapping::new(&map, &spec, size_px);
+                for i in 0..400_usize {
+                    let last = (size_px - 1) as f64;
+                    let (x, y) = ((i * 37 % 400) as f64 / 399.0 * last, (i * 91 % 400) as f64 / 399.0 * last);
+                    let (a, b) = (lattice.map_px(x, y), exact.map_px(x, y));
+                    let error_px = (a[0] - b[0]).hypot(a[1] - b[1]) / lattice.map_px_per_px[0].max(lattice.map_px_per_px[1]);
+                    assert!(error_px < 0.02, "EPSG:{code}, {size_px} px of {m_per_px} m: {error_px} px at {x}, {y}");
+                }
+            }
+        }
     }
 }

@@ -1,5 +1,6 @@
 //! One resolution of a map: the full image or an overview, its layout checked.
 
+use super::embedded;
 use super::ifd::{Directory, Flaw, MAX_VALUES, Structure, flaw};
 use super::source::Source;
 
@@ -28,6 +29,7 @@ const TILE_OFFSETS: (u16, &str) = (324, "TileOffsets");
 const TILE_BYTES: (u16, &str) = (325, "TileByteCounts");
 const EXTRA_SAMPLES: (u16, &str) = (338, "ExtraSamples");
 const SAMPLE_FORMAT: (u16, &str) = (339, "SampleFormat");
+const JPEG_TABLES: (u16, &str) = (347, "JPEGTables");
 const SUBSAMPLING: (u16, &str) = (530, "YCbCrSubSampling");
 
 /// How samples become colours.
@@ -162,6 +164,12 @@ impl Level {
         }
         if packing == Packing::Jpeg && (bits != 8 || (!planar && !matches!(bands, 1 | 3 | 4))) {
             return Err(flaw(COMPRESSION.1, "JPEG of 8 bits and 1, 3 or 4 bands", format!("{bands} bands of {bits} bits")));
+        }
+        if packing == Packing::Jpeg
+            && let Some(tables) = file.opaque(source, directory, JPEG_TABLES)?
+            && !matches!(embedded::jpeg_size(&tables), Ok(None))
+        {
+            return Err(flaw(JPEG_TABLES.1, "tables alone", "a frame, or an end in the middle"));
         }
 
         let tiled = directory.has(TILE_OFFSETS.0);

@@ -73,7 +73,8 @@ fn components_count_groups_that_touch_along_a_side() {
 
 #[test]
 fn k_means_finds_two_clouds() {
-    let samples: Vec<[f32; 3]> = (0..100).map(|i| if i % 2 == 0 { [10.0, i as f32 / 50.0, 0.0] } else { [200.0, i as f32 / 50.0, 0.0] }).collect();
+    let samples: Vec<[f32; 3]> =
+        (0..100).map(|i| if i % 2 == 0 { [10.0, i as f32 / 50.0, 0.0] } else { [200.0, i as f32 / 50.0, 0.0] }).collect();
     let mut middles = k_means(&samples, vec![[0.0; 3], [50.0, 0.0, 0.0]], 8);
     middles.sort_by(|a, b| a[0].total_cmp(&b[0]));
     assert!((middles[0][0] - 10.0).abs() < 1e-3 && (middles[1][0] - 200.0).abs() < 1e-3);

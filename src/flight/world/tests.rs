@@ -16,9 +16,12 @@ fn the_same_seed_gives_the_same_world_and_another_another() {
 fn every_kind_of_cover_occurs_and_no_pixel_is_bare_of_one() {
     for seed in 1..=5 {
         let world = small(seed);
-        let share = |cover: Cover| world.classes.iter().filter(|c| **c == cover as u8).count() as f64 / world.classes.len() as f64;
+        let share =
+            |cover: Cover| world.classes.iter().filter(|c| **c == cover as u8).count() as f64 / world.classes.len() as f64;
         assert_eq!(share(Cover::Unlabelled), 0.0);
-        for (cover, least) in [(Cover::Building, 0.001), (Cover::Bare, 0.1), (Cover::Road, 0.01), (Cover::Vegetation, 0.005), (Cover::Water, 0.005)] {
+        for (cover, least) in
+            [(Cover::Building, 0.001), (Cover::Bare, 0.1), (Cover::Road, 0.01), (Cover::Vegetation, 0.005), (Cover::Water, 0.005)]
+        {
             assert!(share(cover) > least, "seed {seed}: {cover:?} {}", share(cover));
         }
         assert!(world.classes.iter().all(|c| *c <= 5));
