@@ -80,7 +80,7 @@ test-py: py build ## Python tests.
 
 parity: py build ## The published network's recorded numbers, reproduced; the Rust pipeline against the Python one.
 	$(PY) -m sthn.parity models/tests/data
-	$(CARGO) test --locked --test parity -- --ignored --nocapture
+	$(CARGO) test --locked --test parity --test parity_light -- --ignored
 
 replay: build ## The committed flight through the built binary, with thresholds.
 	target/debug/nightfix replay $(FLIGHT) --bundle $(BUNDLE) --out target/replay \

@@ -96,7 +96,7 @@ fn what_cannot_be_tried_ends_with_2_and_says_why() {
         (&["--frame", "absent.png"][..], "absent.png"),
         (&["--frame", "frame.gif"], "frame.gif"),
         (&["--frame", "bundle"], "bundle"),
-        (&["--radius-m", "-3"], "radius-m"),
+        (&["--radius-m=-3"], "radius-m"),
         (&["--config", "absent.toml"], "absent.toml"),
         (&["--gates", "ajar"], "ajar"),
         (&["--onnxruntime", "/no/such/libonnxruntime.so"], "/no/such/libonnxruntime.so"),

@@ -81,7 +81,7 @@ fn projected_unit(code: u32) -> Option<u32> {
         | 32601..=32660 | 32701..=32760             // WGS84 / UTM
         | 32661 | 32761 | 5041 | 5042               // UPS
         | 25828..=25838 | 3035 | 3034               // ETRS89: UTM, LAEA and LCC Europe
-        | 26901..=26923                             // NAD83 / UTM
+        | 26910..=26923                             // NAD83 / UTM; further west PROJ shifts the datum
         | 31978..=31985                             // SIRGAS 2000 / UTM south
         | 2154 | 2180 | 2193 | 5179 | 6372          // France, Poland, New Zealand, Korea, Mexico
         | 3031 | 3413 | 3976 | 3995 | 5070          // polar stereographic, CONUS Albers

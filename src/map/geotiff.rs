@@ -17,6 +17,7 @@ const SUBFILE_OVERVIEW: u64 = 1;
 const SUBFILE_PAGE: u64 = 2;
 const SUBFILE_MASK: u64 = 4;
 const NODATA: (u16, &str) = (42113, "GDAL_NODATA");
+const METADATA: (u16, &str) = (42112, "GDAL_METADATA");
 
 /// An open GeoTIFF: header read and checked, no pixel decoded. [`super::MapCache`] reads its pixels.
 pub struct GeoTiff {
@@ -44,14 +45,19 @@ impl GeoTiff {
         let source = Source::new(File::open(path).map_err(io)?).map_err(io)?;
         let format = |(field, expected, found): Flaw| MapError::Format { path: path.to_owned(), field, expected, found };
         let file = Structure::read(&source).map_err(format)?;
-        let (levels, masks) = read_levels(&file, &source).map_err(format)?;
+        let (mut levels, masks) = read_levels(&file, &source).map_err(format)?;
         let [full, ..] = levels.as_slice() else {
             return Err(format(flaw("directory chain", "a full-resolution image", "none")));
         };
         let Georeference { crs, affine } = Georeference::read(&file, &source, &full.directory).map_err(format)?;
         let nodata = read_nodata(&file, &source, &full.directory).map_err(format)?;
+        let denied = full.alpha.map(|band| denies_alpha(&file, &source, &full.directory, band)).transpose().map_err(format)?;
 
-        let (x, y) = (f64::from(full.width - 1) / 2.0, f64::from(full.height - 1) / 2.0);
+        let (full_width, full_height) = (full.width, full.height);
+        if denied == Some(true) {
+            levels.iter_mut().for_each(|level| level.alpha = None);
+        }
+        let (x, y) = (f64::from(full_width - 1) / 2.0, f64::from(full_height - 1) / 2.0);
         let place = |source| MapError::Place { path: path.to_owned(), source };
         let at = |x: f64, y: f64| {
             let (cx, cy) = affine.apply(x, y);
@@ -214,4 +220,12 @@ fn read_nodata(file: &Structure, source: &Source, directory: &Directory) -> Resu
     let Some(text) = file.text(source, directory, NODATA)? else { return Ok(None) };
     let value: f64 = text.trim().parse().map_err(|_| flaw(NODATA.1, "a number", format!("`{}`", text.trim())))?;
     Ok((value.fract() == 0.0 && (0.0..=65535.0).contains(&value)).then_some(value as u32))
+}
+
+/// Whether GDAL's metadata says that this band, which the tags call alpha, is something else: an infra-red band, say.
+fn denies_alpha(file: &Structure, source: &Source, directory: &Directory, band: usize) -> Result<bool, Flaw> {
+    let Some(text) = file.text(source, directory, METADATA)? else { return Ok(false) };
+    let item = format!("sample=\"{band}\" role=\"colorinterp\">");
+    let role = text.split_once(&item).and_then(|(_, rest)| rest.split('<').next());
+    Ok(role.is_some_and(|role| !role.trim().eq_ignore_ascii_case("alpha")))
 }
