@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from PIL import Image
+
 from sthn import correlate
 from sthn.bundle import read_bundle
 from sthn.lite.export import golden_pair

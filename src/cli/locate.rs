@@ -61,7 +61,7 @@ pub struct Args {
     #[arg(long, default_value_t = 0, allow_negative_numbers = true)]
     stamp_ns: i64,
     /// `off`: gates from implausible_quad on do not close.
-    #[arg(long, value_name = "on|off", default_value = "on", value_parser = parse_switch)]
+    #[arg(long, value_name = "on|off", default_value = "on", value_parser = parse_switch, action = clap::ArgAction::Set)]
     gates: bool,
     /// Configuration for gates, error budget, ONNX Runtime and field of view [default: the built-in defaults].
     #[arg(long, value_name = "TOML")]
