@@ -159,3 +159,25 @@ def test_a_frame_that_cannot_be_used_is_an_error_that_names_it(nightfix: Path, t
         command = [nightfix, "frame", tmp_path / file, "--out", tmp_path / "out.png", *options]
         done = subprocess.run(command, capture_output=True, text=True)
         assert done.returncode == 2 and text in done.stderr and not done.stdout, (file, options, done)
+
+
+def test_a_contact_sheet_of_real_frames(nightfix: Path, tmp_path: Path, shared: Path):
+    command = [nightfix, "frame", "--contact-sheet", shared / "flights" / "guangzhou", "--out", tmp_path / "sheet.png"]
+    done = subprocess.run([*command, "--width-m=120", "--tile-px=96"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    # 107 x 86 m of ground on tiles of 120 x 120 m, at any yaw.
+    assert report["frames"] == 33 and report["failed"] == [] and 0.55 < report["valid_fraction"] < 0.7, report
+    assert cv2.imread(str(tmp_path / "sheet.png"), cv2.IMREAD_UNCHANGED).std() > 30
+
+
+def test_a_frame_that_is_lost_leaves_its_tile_empty(nightfix: Path, tmp_path: Path):
+    cv2.imwrite(str(tmp_path / "there.png"), np.random.default_rng(4).integers(0, 256, (60, 60)).astype(np.uint8))
+    (tmp_path / "flight.toml").write_text("")
+    (tmp_path / "poses.csv").write_text("file,stamp_ns,gsd_m,yaw_deg\nthere.png,1,1,0\nlost.png,2,1,0\nthere.png,3,,0\n")
+    command = [nightfix, "frame", "--contact-sheet", tmp_path, "--out", tmp_path / "sheet.png", "--width-m=60", "--tile-px=60"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 3, done
+    report = json.loads(done.stdout)
+    assert report["frames"] == 1 and [lost["file"] for lost in report["failed"]] == ["lost.png", "there.png"]
+    assert "gsd_m" in report["failed"][1]["why"]

@@ -1,6 +1,8 @@
-//! `nightfix frame`: what the network sees of a frame.
+//! `nightfix frame`: what the network sees of a frame, or of all frames of a flight.
 
+use super::contact_sheet::contact_sheet;
 use super::{Common, Outcome, UsageError};
+use crate::flight::Flight;
 use crate::thermal::{self, Encoding, GrayFrame, Pose, Samples};
 use serde_json::json;
 use std::io::Write;
@@ -10,7 +12,17 @@ use std::path::{Path, PathBuf};
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// The frame: PNG, TIFF, JPEG or raw Y16.
-    frame: PathBuf,
+    #[arg(required_unless_present = "contact_sheet")]
+    frame: Option<PathBuf>,
+    /// Instead of one frame: all of a flight's, rectified, as tiles of one picture, with a cross under the vehicle.
+    #[arg(long, value_name = "FLIGHT", conflicts_with = "frame")]
+    contact_sheet: Option<PathBuf>,
+    /// Ground that a tile of the contact sheet shows, metres.
+    #[arg(long, default_value_t = 512.0)]
+    width_m: f64,
+    /// Side of a tile, pixels.
+    #[arg(long, default_value_t = 192)]
+    tile_px: usize,
     /// The 8-bit PNG to write.
     #[arg(long, value_name = "PNG")]
     out: PathBuf,
@@ -52,15 +64,29 @@ pub struct Args {
     m_per_px: f64,
 }
 
-/// Decodes, tone-maps and rectifies a frame, writes the picture and says on stdout what it is.
+/// Most pixels of a contact sheet: what a picture viewer still opens.
+const MAX_SHEET_PX: usize = 1 << 28;
+
+/// Decodes, tone-maps and rectifies, writes the picture and says on stdout what it is. A frame that cannot be used is a
+/// usage error; on a contact sheet it is an empty tile, and data loss in the end.
 pub fn run(common: &Common, args: Args) -> Result<Outcome, UsageError> {
     let _ = common;
-    let usage = |error: &dyn std::error::Error| UsageError(format!("`{}`: {error}", args.frame.display()));
+    let (report, outcome) = match (&args.frame, &args.contact_sheet) {
+        (_, Some(folder)) => sheet(&args, folder)?,
+        (Some(file), None) => (one_frame(&args, file)?, Outcome::Done),
+        (None, None) => return Err(UsageError("frame: expected a frame or --contact-sheet, found neither".into())),
+    };
+    writeln!(std::io::stdout(), "{report}").map_err(|e| UsageError(format!("stdout: {e}")))?;
+    Ok(outcome)
+}
+
+fn one_frame(args: &Args, file: &Path) -> Result<serde_json::Value, UsageError> {
+    let usage = |error: &dyn std::error::Error| UsageError(format!("`{}`: {error}", file.display()));
     let encoding = args
         .encoding
-        .or_else(|| Encoding::of_file(&args.frame))
-        .ok_or_else(|| UsageError(format!("`{}`: --encoding is needed: the ending says nothing", args.frame.display())))?;
-    let bytes = std::fs::read(&args.frame).map_err(|e| usage(&e))?;
+        .or_else(|| Encoding::of_file(file))
+        .ok_or_else(|| UsageError(format!("`{}`: --encoding is needed: the ending says nothing", file.display())))?;
+    let bytes = std::fs::read(file).map_err(|e| usage(&e))?;
     let raw = thermal::decode(&bytes, encoding, args.width.zip(args.height)).map_err(|e| usage(&e))?;
     let bits = match raw.samples {
         Samples::U8(_) => 8,
@@ -68,7 +94,7 @@ pub fn run(common: &Common, args: Args) -> Result<Outcome, UsageError> {
     };
     let toned = thermal::tone_map(&raw);
     let mut report = json!({
-        "file": args.frame.display().to_string(), "encoding": encoding, "bits": bits, "width": raw.width, "height": raw.height,
+        "file": file.display().to_string(), "encoding": encoding, "bits": bits, "width": raw.width, "height": raw.height,
         "out": args.out.display().to_string(),
     });
     let picture = if args.tone_only {
@@ -93,8 +119,30 @@ pub fn run(common: &Common, args: Args) -> Result<Outcome, UsageError> {
         GrayFrame { width: side, height: side, pixels: square.pixels }
     };
     write_png(&args.out, &picture)?;
-    writeln!(std::io::stdout(), "{report}").map_err(|e| UsageError(format!("stdout: {e}")))?;
-    Ok(Outcome::Done)
+    Ok(report)
+}
+
+fn sheet(args: &Args, folder: &Path) -> Result<(serde_json::Value, Outcome), UsageError> {
+    let flight = Flight::open(folder).map_err(|e| UsageError::from_error(&e))?;
+    for warning in &flight.warnings {
+        tracing::warn!("{warning}");
+    }
+    let pixels = args.tile_px.checked_mul(args.tile_px).and_then(|tile| tile.checked_mul(flight.rows.len()));
+    if args.tile_px == 0 || !pixels.is_some_and(|pixels| (1..=MAX_SHEET_PX).contains(&pixels)) {
+        let found = format!("{} tiles of {} px", flight.rows.len(), args.tile_px);
+        return Err(UsageError(format!("contact sheet: expected 1 to {MAX_SHEET_PX} pixels in all, found {found}")));
+    }
+    let sheet = contact_sheet(&flight, args.width_m, args.tile_px);
+    for (file, error) in &sheet.failed {
+        tracing::warn!("`{file}`: {error}");
+    }
+    write_png(&args.out, &sheet.picture)?;
+    let failed: Vec<_> = sheet.failed.iter().map(|(file, error)| json!({"file": file, "why": error.to_string()})).collect();
+    let report = json!({
+        "flight": folder.display().to_string(), "out": args.out.display().to_string(), "frames": sheet.frames, "failed": failed,
+        "width_m": args.width_m, "tile_px": args.tile_px, "valid_fraction": sheet.valid_fraction,
+    });
+    Ok((report, if failed.is_empty() { Outcome::Done } else { Outcome::DataLoss }))
 }
 
 fn write_png(path: &Path, picture: &GrayFrame) -> Result<(), UsageError> {

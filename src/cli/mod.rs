@@ -2,6 +2,7 @@
 //! configuration; 3 finished with data loss. JSON on stdout, logs on stderr.
 
 mod check;
+mod contact_sheet;
 mod frame;
 mod locate;
 mod replay;
