@@ -89,7 +89,7 @@ replay: build ## The committed flight through the built binary, with thresholds.
 lint: venv ## rustfmt, clippy and ruff; every warning is an error.
 	scripts/host.sh lint
 	$(CARGO) fmt --check
-	$(CARGO) clippy --locked --all-targets -- -D warnings
+	$(CARGO) clippy --locked --lib --bins -- -D warnings
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 
