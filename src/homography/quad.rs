@@ -3,7 +3,7 @@
 use super::{DltError, Homography, dlt};
 
 /// Corner displacements `[x|y][top|bottom][left|right]`, cumulative, in stage-input map pixels, from the identity
-/// corners (0, 0) .. (R - 1, R - 1). Model bundle contract; `sthn-reference.md` 1.5.
+/// corners (0, 0) .. (R - 1, R - 1). "Model bundle" in `ARCHITECTURE.md`.
 pub type Displacement = [[[f64; 2]; 2]; 2];
 
 /// Four points, TL, TR, BL, BR.
@@ -113,7 +113,7 @@ pub fn displacement_of_box(edges: &Quad, stage_size_px: usize, alpha: f64) -> Di
 mod tests {
     use super::*;
 
-    /// Published ground truth of a centred 512 m frame, R = 256: first and last inclusive corner (`sthn-reference.md` 1.5).
+    /// Published ground truth of a centred 512 m frame, R = 256: first and last inclusive corner.
     const PUBLISHED: [(usize, f64, f64); 3] =
         [(512, 0.0, 255.0), (1024, 64.0, 191.0), (1536, 256.0 / 3.0, 256.0 - 256.0 / 3.0 - 1.0)];
 

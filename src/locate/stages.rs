@@ -250,7 +250,7 @@ impl Geometry {
     }
 }
 
-/// The published kind of refine stage: the square bounding box of the coarse quad, padded; `sthn-reference.md` 1.7.
+/// The published kind of refine stage: the square bounding box of the coarse quad, padded; see `models/sthn/network/two_stage.py`.
 pub fn refine_bounding_box(
     bundle: &mut Bundle,
     window: &WindowView<'_>,

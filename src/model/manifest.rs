@@ -162,16 +162,16 @@ pub enum Content {
 pub enum Resize {
     /// Bilinear, antialias, half-pixel centres (torch `antialias=True, align_corners=False`).
     HalfPixelAntialias,
-    /// torch `antialias=True, align_corners=True`: `sthn-reference.md` 1.6.
+    /// torch `antialias=True, align_corners=True`: see `models/sthn/network/resize.py`.
     AlignCornersAntialias,
-    /// Bilinear between corner pixels, zero outside, no antialias: `sthn-reference.md` 1.7. Crops only.
+    /// Bilinear between corner pixels, zero outside, no antialias: see `models/sthn/network/two_stage.py`. Crops only.
     AlignCornersBilinear,
     /// Mean of n x n bilinear samples spread evenly over the pixel, n = max(1, round(source pixels per pixel)); for
     /// turned and scaled grids.
     Supersample,
 }
 
-/// Direction of the look-up: `sthn-reference.md` 1b.
+/// Direction of the look-up: see `models/sthn/network/correlation.py`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Lookup {
@@ -197,7 +197,7 @@ pub struct Crop {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum CropShape {
-    /// The axis-aligned bounding box of the coarse quad, made square: paper Sec. III-C, `sthn-reference.md` 1.7.
+    /// The axis-aligned bounding box of the coarse quad, made square: paper Sec. III-C, `models/sthn/network/two_stage.py`.
     BoundingBox,
     /// The frame's square under the coarse similarity (its centre, rotation and scale), so that what is left to find
     /// is small.

@@ -252,7 +252,7 @@ class RefineNet(nn.Module):
         edges = torch.tensor([[a, a], [b, a], [a, b], [b, b]], device=corners.device)
         at = apply(homography_of_square(corners, float(self.frame_px)), edges)
         e = float(self.map_px - 1)
-        # left edge + 0.5, right edge - 0.5: `sthn-reference` corners are inclusive pixels.
+        # left edge + 0.5, right edge - 0.5: published corners are inclusive pixels.
         inward = torch.tensor([[0.5, 0.5], [-0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]], device=corners.device)
         identity = torch.tensor([[0.0, 0.0], [e, 0.0], [0.0, e], [e, e]], device=corners.device)
         return (at + inward - identity).permute(0, 2, 1).reshape(-1, 2, 2, 2)
