@@ -139,7 +139,7 @@ mod tests {
 
     #[test]
     fn mounts_by_hand() {
-        // Turned by 90 degrees: the vehicle's nose-up pitch tips the camera's right side ... forward is the camera's left.
+        // Turned by 90 degrees, the vehicle's nose is on the camera's left: nose up is right side down.
         let turned = CameraModel { mount_yaw_deg: 90.0, ..CameraModel::default() };
         let camera = turned.camera_pose(&pose(10.0, 5.0, 0.0));
         assert!(close(camera.yaw_deg, 100.0) && close(camera.pitch_deg, 0.0) && close(camera.roll_deg, 5.0), "{camera:?}");

@@ -121,7 +121,7 @@ impl View {
 /// Height and focal length; at nadir only their ratio counts.
 #[derive(Debug, Clone, Copy)]
 struct Optics {
-    /// Height over ground in the units of `focal_px * gsd`, metres where `agl_m` is known.
+    /// Height above ground, metres.
     height_m: f64,
     focal_px: f64,
     agl_m: Option<f64>,
