@@ -103,8 +103,12 @@ def learning_rate(step: int, steps: int, peak: float, warm_up: int = 100) -> flo
 
 
 def start_from(net: torch.nn.Module, weights: Path) -> None:
-    """Encoders of another stage as a start: features that match across the spectra serve at every scale."""
+    """Weights of the same stage as a start; of another stage its encoders: features that match across the spectra serve
+    at every scale."""
     found = torch.load(weights, weights_only=True)
+    if found.keys() == net.state_dict().keys():
+        net.load_state_dict(found)
+        return
     encoders = {name: value for name, value in found.items() if name.startswith(("map_encoder.", "frame_encoder."))}
     missing, extra = net.load_state_dict(encoders, strict=False)
     if extra or any(name.startswith(("map_encoder.", "frame_encoder.")) for name in missing):
@@ -195,7 +199,7 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--maps", type=Path, required=True, help="folder of the training maps")
     parser.add_argument("--worlds", type=Path, help="folder of procedural worlds (GeoTIFF, `nightfix simulate --world`)")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--init", type=Path, help="folder of a training whose encoders are the start")
+    parser.add_argument("--init", type=Path, help="folder of a training whose weights (same stage) or encoders (another) are the start")
     parser.add_argument("--steps", type=int, default=1600)
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--peak", type=float, default=3e-3)
