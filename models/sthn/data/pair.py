@@ -7,7 +7,7 @@ flights, both the same other scale). Quads are TL, TR, BL, BR.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,11 @@ class Pair:
     """`[3, 3]`, truth: frame px -> window px."""
     terrain: str = ""
     """Kind of ground, for tables by terrain; empty where unknown."""
+    m_per_px: float = 1.0
+    """Metres per pixel of window and frame alike: errors in metres are errors in window pixels times this."""
+    surround: NDArray[np.uint8] | None = None
+    """`[n, n]`, what the sensor saw about the frame, which is its centre crop; n - 512 is even. Noise turns and scales it,
+    so that a turned frame has no empty corners. None where no more was seen."""
 
     @property
     def window_m(self) -> int:
@@ -88,3 +93,11 @@ class PairSource(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int) -> Pair: ...
+
+
+class TrainingSource(PairSource, Protocol):
+    """A source that training can draw from more than once."""
+
+    def reseeded(self, seed: int | tuple[int, ...]) -> Self:
+        """The same source with other draws: for another pass."""
+        ...
