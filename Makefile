@@ -99,7 +99,7 @@ format: venv ## Format Rust and Python in place.
 	$(VENV)/bin/ruff format .
 
 bench: py release ## Speed of each step beside OpenCV, ONNX Runtime beside PyTorch, as ratios.
-	$(CARGO) bench --locked
+	$(PY) models/bench/compare.py
 
 clean: ## Remove what was built (target/); .venv stays.
 	rm -rf target

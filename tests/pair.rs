@@ -93,7 +93,7 @@ fn an_unknown_yaw_is_searched_for_on_the_whole_circle() {
 fn the_search_disc_masks_and_is_about_the_vehicle() {
     let mut scene = Scene::new(6);
     let middle = (FRAME_PX as f64 - 1.0) / 2.0;
-    let near = Search { centre_px: [150.0, 230.0], radius_m: 20.0, vehicle_px: [middle, middle], yaw_known: true };
+    let near = Search { centre_px: [150.0, 230.0], radius_m: 20.0, vehicle_px: [middle, middle], yaw_known: true, crops: false };
     let found = scene.find(230.0, 150.0, 0.0, 1.0, &near);
     let [x, y] = found.homography.apply(middle, middle);
     assert!((x - 150.0).hypot(y - 230.0) < 20.0 + 24.0, "not outside the disc but for the sub-cell shift: {x} {y}");

@@ -143,9 +143,19 @@ fn open_gates() -> GateSettings {
         max_second_peak: 1.0,
         max_stage_shift_m: 1e4,
         max_refine_residual_m: 1e4,
+        max_p_over_25m: 1.0,
+        crops: false,
     }
 }
 
 fn budget() -> BudgetSettings {
-    BudgetSettings { sigma_tilt_deg: 1.0, sigma_tilt_unknown_deg: 3.0, assumed_agl_m: 120.0, map_sigma_m: 2.0, floor_m: 1.0 }
+    BudgetSettings {
+        sigma_tilt_deg: 1.0,
+        sigma_tilt_unknown_deg: 3.0,
+        assumed_agl_m: 120.0,
+        map_sigma_m: 2.0,
+        sigma_stamp_s: 0.0,
+        speed_mps: 0.0,
+        floor_m: 1.0,
+    }
 }

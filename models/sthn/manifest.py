@@ -8,6 +8,7 @@ import json
 import math
 import tomllib
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 SCHEMA = 1
@@ -125,6 +126,30 @@ def _stage(path: str, value: Any) -> None:
     (_MATCHER if kind == "matcher" else _CORRELATION)(path, value)
 
 
+_INTEGRITY = _table(
+    {
+        "data": _text,
+        "command": _text,
+        "trials": _count,
+        "bound_m": _number,
+        "bias": _number,
+        "cues": _list(
+            _table(
+                {
+                    "name": _text,
+                    "transform": _choice("linear", "log", "logit"),
+                    "low": _number,
+                    "high": _number,
+                    "weight": _number,
+                    "sigma_weight": _number,
+                }
+            )
+        ),
+        "probability": _table({"scores": _list(_number), "p": _list(_number)}),
+        "sigma": _table({"bias": _number, "least_m": _number, "most_m": _number, "tail999": _number}),
+    }
+)
+
 _MANIFEST = _table(
     {
         "schema": _count,
@@ -143,6 +168,8 @@ _MANIFEST = _table(
     },
     {
         "refine": _stage,
+        "scale_range": _list(_number),
+        "integrity": _INTEGRITY,
         "accuracy": _table(
             {
                 "data": _text,
@@ -182,6 +209,30 @@ def check(manifest: dict[str, Any]) -> None:
         if refine["kind"] != "matcher":
             raise ManifestError("refine.kind", "matcher", refine["kind"])
         _check_matcher(manifest, "refine", refine)
+    if (scales := manifest.get("scale_range")) is not None:
+        if len(scales) != 2:
+            raise ManifestError("scale_range", "two numbers", scales)
+        _within("scale_range[0]", scales[0], 0.01, 1)
+        _within("scale_range[1]", scales[1], 1, 100)
+    if (integrity := manifest.get("integrity")) is not None:
+        _check_integrity(integrity)
+
+
+def _check_integrity(table: dict[str, Any]) -> None:
+    _within("integrity.bound_m", table["bound_m"], 1, 1e4)
+    if not 1 <= len(table["cues"]) <= 64:
+        raise ManifestError("integrity.cues", "1 to 64", len(table["cues"]))
+    for i, cue in enumerate(table["cues"]):
+        if cue["low"] > cue["high"]:
+            raise ManifestError(f"integrity.cues[{i}]", "low <= high", cue)
+    scores, p = table["probability"]["scores"], table["probability"]["p"]
+    rising = all(a < b for a, b in pairwise(scores)) and all(a <= b for a, b in pairwise(p))
+    if len(scores) != len(p) or not 1 <= len(p) <= 256 or not rising or not all(0 <= x <= 1 for x in p):
+        raise ManifestError("integrity.probability", "1 to 256 rising scores with as many probabilities that do not fall", p)
+    sigma = table["sigma"]
+    _within("integrity.sigma.least_m", sigma["least_m"], 1e-3, sigma["most_m"])
+    _within("integrity.sigma.most_m", sigma["most_m"], sigma["least_m"], 1e4)
+    _within("integrity.sigma.tail999", sigma["tail999"], 3.7169 - 1e-3, 1e3)
 
 
 def _equal(path: str, value: float, expected: float, what: str = "") -> None:
@@ -264,13 +315,16 @@ COMMENTS = {
     "scales": "scale hypotheses: true footprint over assumed",
     "subcell_radius": "cells round the peak of the sub-cell soft-argmax",
     "padding_m": "added on each side of the square",
+    "scale_range": "frame, window and D_C may be scaled together by this, the pixels staying as many",
+    "bound_m": "an error above this counts as a wrong place",
+    "tail999": "radius of probability 0.999, in sigmas",
 }
 """What stands beside a field in the written file."""
 
 
 ORDER = (
     *("schema", "name", "licence", "window_width_m", "window_margin_m", "frame_width_m", "m_per_px", "search_radius_m"),
-    *("tone_mapping", "opset", "golden", "provenance", "accuracy", "coarse", "refine"),
+    *("scale_range", "tone_mapping", "opset", "golden", "provenance", "accuracy", "coarse", "refine", "integrity"),
     *("kind", "map_graph", "graph", "lookup", "stride", "rotations_deg", "scales", "subcell_radius"),
     *("tolerance_px", "tolerance", "match_sigma_m", "map", "frame", "crop"),
 )
@@ -313,6 +367,8 @@ def _value(value: Any) -> str:
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{name} = {_value(inner)}" for name, inner in value.items()) + " }"
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return "[\n" + "".join(f"    {_value(element)},\n" for element in value) + "]"
     if isinstance(value, list):
         return "[" + ", ".join(_value(element) for element in value) + "]"
     return repr(value)

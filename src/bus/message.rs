@@ -48,12 +48,18 @@ pub struct FixMessage {
     pub radius999_m: Option<f64>,
     /// Whether the stated error was calibrated. False without a fix.
     pub calibrated: bool,
+    /// Probability that the error is above 25 m; absent where the bundle has no calibration.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub p_over_25m: Option<f64>,
     /// Recovered yaw of image up, degrees clockwise from true north.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub yaw_deg: Option<f64>,
     /// Recovered frame metres / assumed metres.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub scale: Option<f64>,
+    /// Whether it was found by a search beyond the bundle's D_C (and confirmed by another frame).
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub searched: bool,
     /// Which stage the result comes from.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stage: Option<StageName>,
@@ -151,8 +157,10 @@ impl FixMessage {
             radius95_m: fix.map(|f| f.radius95_m),
             radius999_m: fix.map(|f| f.radius999_m),
             calibrated: fix.is_some_and(|f| f.calibrated),
+            p_over_25m: fix.and_then(|f| f.p_over_25m),
             yaw_deg: fix.map(|f| f.yaw_deg),
             scale: fix.map(|f| f.scale),
+            searched: answer.searched && fix.is_some(),
             stage: fix.map(|f| f.stage),
             window_m: answer.window.map(|w| w.width_m),
             homography: fix.map(|f| f.homography),

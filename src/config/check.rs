@@ -66,12 +66,15 @@ impl Settings {
         between("gates.max_second_peak", gates.max_second_peak, 0.0, 1.0)?;
         at_most("gates.max_stage_shift_m", gates.max_stage_shift_m, 100_000.0)?;
         at_most("gates.max_refine_residual_m", gates.max_refine_residual_m, 100_000.0)?;
+        between("gates.max_p_over_25m", gates.max_p_over_25m, 0.0, 1.0)?;
 
         let budget = &self.budget;
         at_most("budget.sigma_tilt_deg", budget.sigma_tilt_deg, 90.0)?;
         at_most("budget.sigma_tilt_unknown_deg", budget.sigma_tilt_unknown_deg, 90.0)?;
         positive("budget.assumed_agl_m", budget.assumed_agl_m, 100_000.0)?;
         at_most("budget.map_sigma_m", budget.map_sigma_m, 100_000.0)?;
+        at_most("budget.sigma_stamp_s", budget.sigma_stamp_s, 60.0)?;
+        at_most("budget.speed_mps", budget.speed_mps, 1000.0)?;
         positive("budget.floor_m", budget.floor_m, 100_000.0)?;
 
         self.check_zenoh(source)?;

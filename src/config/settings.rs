@@ -110,6 +110,11 @@ pub struct GateSettings {
     pub max_stage_shift_m: f64,
     /// Largest weighted residual of the refine stage's patches, metres (`low_evidence`).
     pub max_refine_residual_m: f64,
+    /// Largest calibrated probability of an error above 25 m (`low_evidence`); for bundles that are calibrated.
+    pub max_p_over_25m: f64,
+    /// Whether the refine stage also sees the frame with parts covered: evidence, for four more frames of its cost. A
+    /// calibration that was made with it needs it.
+    pub crops: bool,
 }
 
 /// Error budget, 1-sigma.
@@ -124,6 +129,10 @@ pub struct BudgetSettings {
     pub assumed_agl_m: f64,
     /// Absolute accuracy of the map per axis, metres.
     pub map_sigma_m: f64,
+    /// Error of the frames' time stamps, seconds; times `speed_mps`.
+    pub sigma_stamp_s: f64,
+    /// Speed that is assumed for the time stamp's term, metres per second.
+    pub speed_mps: f64,
     /// Never below this per axis, metres.
     pub floor_m: f64,
 }

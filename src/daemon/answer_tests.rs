@@ -46,6 +46,7 @@ fn locate(query: &Query<'_>) -> Answer {
             radius95_m: 5.0,
             radius999_m: 8.0,
             calibrated: false,
+            p_over_25m: None,
             yaw_deg: 0.0,
             scale: 1.0,
             stage: StageName::Coarse,
@@ -53,6 +54,7 @@ fn locate(query: &Query<'_>) -> Answer {
         }),
     };
     Answer {
+        searched: false,
         outcome,
         prior: query.prior.as_ref().ok().copied(),
         window: None,

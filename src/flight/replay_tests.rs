@@ -23,6 +23,7 @@ impl Locate for Echo {
                 radius95_m: 2.5,
                 radius999_m: 4.0,
                 calibrated: false,
+                p_over_25m: None,
                 yaw_deg: 0.0,
                 scale: 1.0,
                 stage: StageName::Refine,
@@ -31,7 +32,14 @@ impl Locate for Echo {
         };
         let prior = query.prior.clone().ok();
         let window = prior.map(|p| WindowInfo { centre: p.position, width_m: 1536.0, map_affine: [0.0; 6] });
-        Answer { outcome, prior, window, evidence: Default::default(), latency_ms: [("total".to_owned(), 1.0)].into() }
+        Answer {
+            outcome,
+            prior,
+            searched: false,
+            window,
+            evidence: Default::default(),
+            latency_ms: [("total".to_owned(), 1.0)].into(),
+        }
     }
     fn identity(&self) -> (String, MapId) {
         ("echo".into(), MapId { name: "m.tif".into(), digest: "00".into() })

@@ -74,6 +74,8 @@ pub struct Fix {
     pub radius999_m: f64,
     /// Whether those numbers were calibrated.
     pub calibrated: bool,
+    /// Calibrated probability that the error is above 25 m, where the bundle has a calibration.
+    pub p_over_25m: Option<f64>,
     /// Recovered yaw of image up, degrees clockwise from true north, 0..360.
     pub yaw_deg: f64,
     /// Recovered frame metres / assumed metres.
@@ -108,6 +110,8 @@ pub struct Answer {
     pub outcome: Result<Fix, NoFix>,
     /// The prior that was used.
     pub prior: Option<Prior>,
+    /// Whether it was found by a search beyond the bundle's D_C: never published before another frame confirms it.
+    pub searched: bool,
     /// The window, where one was made.
     pub window: Option<WindowInfo>,
     /// Evidence gathered up to the gate that closed.

@@ -19,12 +19,15 @@ pub struct StatedError {
     pub radius999_m: f64,
 }
 
-/// covariance = match^2 + (agl x tilt)^2 + map^2 + floor^2 per axis. `match_sigma_m` is the last stage's, from the bundle.
+/// covariance = match^2 + (agl x tilt)^2 + map^2 + (stamp x speed)^2 + floor^2 per axis. `match_sigma_m` is the calibration's
+/// for this match, else the last stage's, from the bundle; `tail999` is the radius of 0.999 in sigmas where the calibration
+/// found a wider one than a Gaussian's.
 /// Where pitch or roll are unknown, nadir was assumed and the tilt is `sigma_tilt_unknown_deg`; where the height is
 /// unknown, `assumed_agl_m` stands in. Each term goes into the evidence.
 pub fn stated_error(
     settings: &BudgetSettings,
     match_sigma_m: f64,
+    tail999: f64,
     pose: &Pose,
     agl_m: Option<f64>,
     evidence: &mut Evidence,
@@ -37,6 +40,7 @@ pub fn stated_error(
         ("sigma_match_m", match_sigma_m),
         ("sigma_tilt_m", tilt_m),
         ("sigma_map_m", settings.map_sigma_m),
+        ("sigma_stamp_m", settings.sigma_stamp_s * settings.speed_mps),
         ("sigma_floor_m", settings.floor_m),
     ] {
         evidence.insert(name.into(), sigma_m);
@@ -44,7 +48,9 @@ pub fn stated_error(
     }
     let covariance_enu_m2 = [[variance_m2, 0.0], [0.0, variance_m2]];
     let widest_m2 = largest_eigenvalue(&covariance_enu_m2);
-    StatedError { covariance_enu_m2, radius95_m: (CHI2_095 * widest_m2).sqrt(), radius999_m: (CHI2_0999 * widest_m2).sqrt() }
+    let sigma_m = widest_m2.sqrt();
+    let radius999_m = CHI2_0999.sqrt().max(tail999) * sigma_m;
+    StatedError { covariance_enu_m2, radius95_m: CHI2_095.sqrt() * sigma_m, radius999_m }
 }
 
 /// Of a symmetric matrix. With unequal axes the circle of this sigma holds more than its probability, never less.
@@ -57,28 +63,39 @@ fn largest_eigenvalue(m: &[[f64; 2]; 2]) -> f64 {
 mod tests {
     use super::*;
 
-    const SETTINGS: BudgetSettings =
-        BudgetSettings { sigma_tilt_deg: 0.5, sigma_tilt_unknown_deg: 2.0, assumed_agl_m: 500.0, map_sigma_m: 1.0, floor_m: 0.5 };
+    const SETTINGS: BudgetSettings = BudgetSettings {
+        sigma_tilt_deg: 0.5,
+        sigma_tilt_unknown_deg: 2.0,
+        assumed_agl_m: 500.0,
+        map_sigma_m: 1.0,
+        sigma_stamp_s: 0.02,
+        speed_mps: 20.0,
+        floor_m: 0.5,
+    };
 
     #[test]
     fn terms_add_in_squares_and_are_named() {
         let pose = Pose { pitch_deg: Some(1.0), roll_deg: Some(0.0), ..Pose::default() };
         let mut evidence = Evidence::new();
-        let error = stated_error(&SETTINGS, 3.0, &pose, Some(100.0), &mut evidence);
+        let error = stated_error(&SETTINGS, 3.0, 0.0, &pose, Some(100.0), &mut evidence);
         let tilt = 100.0 * 0.5f64.to_radians();
-        let variance = 9.0 + tilt * tilt + 1.0 + 0.25;
+        let variance = 9.0 + tilt * tilt + 1.0 + 0.16 + 0.25;
         assert!((error.covariance_enu_m2[0][0] - variance).abs() < 1e-12 && error.covariance_enu_m2[0][1] == 0.0);
         assert!((error.radius95_m - (5.991f64 * variance).sqrt()).abs() < 1e-3);
         assert!((error.radius999_m - (13.816f64 * variance).sqrt()).abs() < 1e-3);
         assert_eq!(evidence["sigma_match_m"], 3.0);
-        assert_eq!(evidence.len(), 4);
+        assert_eq!((evidence["sigma_stamp_m"], evidence.len()), (0.4, 5));
+        // A calibration that found wider tails than a Gaussian's widens the far radius only.
+        let wide = stated_error(&SETTINGS, 3.0, 5.0, &pose, Some(100.0), &mut evidence);
+        assert_eq!(wide.radius95_m, error.radius95_m);
+        assert!((wide.radius999_m - 5.0 * variance.sqrt()).abs() < 1e-9);
     }
 
     #[test]
     fn what_is_unknown_costs() {
         let mut evidence = Evidence::new();
         let half_known = Pose { pitch_deg: Some(0.0), ..Pose::default() };
-        stated_error(&SETTINGS, 1.0, &half_known, None, &mut evidence);
+        stated_error(&SETTINGS, 1.0, 0.0, &half_known, None, &mut evidence);
         assert!((evidence["sigma_tilt_m"] - 500.0 * 2.0f64.to_radians()).abs() < 1e-12);
     }
 

@@ -4,6 +4,7 @@ use super::{Evidence, FrameView, NoFix, Reason};
 use crate::config::GateSettings;
 use crate::homography::{Expected, Homography, Quad, check};
 use crate::map::Window;
+use crate::model::{Integrity, Judgement};
 
 /// Points along a side of the grid on which the map under a quad is probed.
 const PROBES: usize = 96;
@@ -87,9 +88,12 @@ pub fn judge_map(share: f64, settings: &GateSettings) -> Result<(), NoFix> {
     Err(NoFix::new(Reason::Nodata, detail))
 }
 
-/// `low_evidence`, then `ambiguous`: each bound applies where its number exists.
+/// `low_evidence`, then `ambiguous`: each bound applies where its number exists. Two peaks of similar weight share the
+/// posterior: for them its mass is that of both, so that they are told apart from a posterior without peaks.
 pub fn judge_evidence(evidence: &Evidence, settings: &GateSettings) -> Result<(), NoFix> {
-    if let Some(mass) = evidence.get("peak_mass").filter(|mass| !(**mass >= settings.min_peak_mass)) {
+    let second = evidence.get("second_peak").copied().unwrap_or(0.0);
+    let rivals = if second > settings.max_second_peak { second } else { 0.0 };
+    if let Some(mass) = evidence.get("peak_mass").filter(|mass| !(**mass * (1.0 + rivals) >= settings.min_peak_mass)) {
         let detail = format!("posterior mass round the peak: expected at least {}, found {mass:.3}", settings.min_peak_mass);
         return Err(NoFix::new(Reason::LowEvidence, detail));
     }
@@ -106,6 +110,28 @@ pub fn judge_evidence(evidence: &Evidence, settings: &GateSettings) -> Result<()
         return Err(NoFix::new(Reason::Ambiguous, detail));
     }
     Ok(())
+}
+
+/// `low_evidence` by the bundle's calibration: what it says of the evidence, or the reason that it closes. Tested last, so
+/// that two peaks are `ambiguous` and not merely improbable. `None` where the bundle is not calibrated.
+pub fn judge_probability(
+    integrity: Option<&Integrity>,
+    evidence: &Evidence,
+    settings: &GateSettings,
+) -> Result<Option<Judgement>, NoFix> {
+    let Some(integrity) = integrity else { return Ok(None) };
+    let judgement = match integrity.judge(evidence) {
+        Ok(judgement) => judgement,
+        // Without gates an answer is wanted; that it is not calibrated is said.
+        Err(_) if !settings.enabled => return Ok(None),
+        Err(missing) => return Err(NoFix::new(Reason::LowEvidence, missing.to_string())),
+    };
+    let (p, most) = (judgement.p_over_bound, settings.max_p_over_25m);
+    if settings.enabled && !(p <= most) {
+        let detail = format!("probability of an error above {} m: expected at most {most}, found {p:.4}", integrity.bound_m);
+        return Err(NoFix::new(Reason::LowEvidence, detail));
+    }
+    Ok(Some(judgement))
 }
 
 #[cfg(test)]
@@ -125,6 +151,8 @@ mod tests {
             max_second_peak: 0.5,
             max_stage_shift_m: 40.0,
             max_refine_residual_m: 8.0,
+            max_p_over_25m: 0.1,
+            crops: true,
         }
     }
 
@@ -160,7 +188,9 @@ mod tests {
             judge(&[("peak_mass", 0.5), ("second_peak", 0.5), ("stage_shift_m", 40.0), ("refine_residual_m", 8.0)]),
             Ok(())
         );
-        assert_eq!(judge(&[("peak_mass", 0.49), ("second_peak", 0.9)]), Err(Reason::LowEvidence));
+        assert_eq!(judge(&[("peak_mass", 0.49), ("second_peak", 0.4)]), Err(Reason::LowEvidence));
+        assert_eq!(judge(&[("peak_mass", 0.49), ("second_peak", 0.9)]), Err(Reason::Ambiguous));
+        assert_eq!(judge(&[("peak_mass", 0.2), ("second_peak", 0.9)]), Err(Reason::LowEvidence));
         assert_eq!(judge(&[("stage_shift_m", 40.1)]), Err(Reason::LowEvidence));
         assert_eq!(judge(&[("refine_residual_m", 8.1)]), Err(Reason::LowEvidence));
         assert_eq!(judge(&[("second_peak", 0.51)]), Err(Reason::Ambiguous));

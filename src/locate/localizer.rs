@@ -1,14 +1,16 @@
 //! The localizer: a bundle, a map and settings; queries in, answers out.
 
-use super::gates::{judge_distance, judge_evidence, judge_frame, judge_map, judge_quad, map_valid_share};
+use super::cues;
+use super::gates::{judge_distance, judge_evidence, judge_frame, judge_map, judge_probability, judge_quad, map_valid_share};
 use super::inputs::{FrameView, WindowView};
 use super::pair::{PairError, PairMatch, Search, Steps, match_pair, similarity_of};
 use super::windows::{WindowError, Windows, window_centre};
 use super::{Answer, Evidence, Fix, NoFix, Prior, Query, Reason, StageName, WindowInfo, budget};
 use crate::config::{BudgetSettings, GateSettings};
 use crate::geo::LatLon;
+use crate::homography::Homography;
 use crate::map::{MapCache, MapError, Window, WindowSpec};
-use crate::model::{Bundle, StageManifest};
+use crate::model::{Bundle, Judgement, StageManifest};
 use crate::thermal::{Pose, Rectified, decode, rectify, tone_map};
 use std::sync::Arc;
 
@@ -92,7 +94,7 @@ impl Localizer {
             *latency_ms.entry((*name).to_owned()).or_insert(0.0) += ms;
         }
         let OnTheWay { prior, window, evidence, seen } = on_the_way;
-        (Answer { outcome, prior, window, evidence, latency_ms }, seen)
+        (Answer { outcome, prior, searched: false, window, evidence, latency_ms }, seen)
     }
 
     /// The bundle.
@@ -116,32 +118,44 @@ impl Localizer {
         way.prior = Some(prior);
         self.judge_prior(&prior)?;
         let (frame, pose) = self.read_frame(query, steps)?;
+        let scale = frame.m_per_px / self.bundle.manifest.m_per_px;
+        self.judge_scaled_prior(&prior, scale)?;
         let way_frame = way.seen.frame.insert(frame);
         let view = FrameView { size_px: way_frame.size_px, gray: &way_frame.pixels, seen: &way_frame.valid };
-        self.judge_map_reach(&prior)?;
+        self.judge_map_reach(&prior, scale)?;
         judge_frame(&view, &self.gates, &mut way.evidence)?;
+        let texture = cues::frame_texture(&view);
+        way.evidence.insert("frame_texture".into(), texture.coarse);
+        way.evidence.insert("frame_smoothness".into(), texture.smoothness);
         steps.done("frame_gates");
 
         let manifest = &self.bundle.manifest;
-        let (margin_px, frame_px) = (manifest.margin_px(), manifest.frame_px());
-        let slack_m = (manifest.window_width_m - manifest.frame_width_m) / 2.0 - prior.radius_m;
+        let (margin_px, frame_px, frame_width_m) = (manifest.margin_px(), manifest.frame_px(), manifest.frame_width_m);
+        let slack_m = scale * (manifest.window_width_m - manifest.frame_width_m) / 2.0 - prior.radius_m;
         let centre = window_centre(self.map_centre, prior.position, slack_m);
-        let width_m = manifest.window_width_m;
-        let spec = WindowSpec { centre, width_m: width_m + 2.0 * manifest.window_margin_m, m_per_px: manifest.m_per_px };
+        let width_m = scale * manifest.window_width_m;
+        let m_per_px = scale * manifest.m_per_px;
+        let spec = WindowSpec { centre, width_m: width_m + 2.0 * scale * manifest.window_margin_m, m_per_px };
         let kept = self.windows.get(&spec, &mut self.bundle, steps).map_err(no_window)?;
         let window = Arc::clone(&kept.window);
         way.seen.window = Some(Arc::clone(&window));
-        way.window = Some(WindowInfo { centre, width_m, map_affine: inner_affine(&window, margin_px) });
+        let map_affine = affine_at_metres(&inner_affine(&window, margin_px), scale);
+        way.window = Some(WindowInfo { centre, width_m, map_affine });
         steps.done("window");
 
         let (x, y) = window.to_px(prior.position);
         let search = Search {
             centre_px: [x - margin_px as f64, y - margin_px as f64],
-            radius_m: prior.radius_m,
+            radius_m: prior.radius_m / scale,
             vehicle_px: [way_frame.vehicle_px.0, way_frame.vehicle_px.1],
             yaw_known: query.pose.yaw_deg.is_some(),
+            crops: self.gates.crops,
         };
         let picture = WindowView { size_px: window.size_px, rgb: &window.rgb };
+        let reach_px = prior.radius_m / scale + frame_width_m / 2.0;
+        let texture = cues::map_texture(&picture, [x, y], reach_px);
+        way.evidence.insert("map_texture".into(), texture.coarse);
+        steps.done("map_texture");
         let found = match_pair(&mut self.bundle, &picture, &mut kept.map, &view, &search, steps).map_err(no_match)?;
         way.evidence.extend(found.evidence.iter().map(|(name, value)| (name.clone(), *value)));
 
@@ -156,14 +170,38 @@ impl Localizer {
             position.ok_or_else(|| NoFix::new(Reason::NonFinite, "place of the vehicle: expected a position, found none"))?;
         let map_valid = map_valid_share(&found.homography, frame_px, &window, margin_px);
         way.evidence.insert("map_valid".into(), map_valid);
+        let shape = cues::shape(&found.quad, self.bundle.manifest.frame_width_m);
+        let agreement = cues::gradient_agreement(&view, &picture, margin_px as f64, &found.homography);
+        for (name, value) in [
+            ("quad_scale_error", shape.scale_error),
+            ("quad_turn_deg", shape.turn_deg),
+            ("quad_side_ratio", shape.side_ratio),
+            ("gradient_agreement", agreement),
+            ("prior_distance_share", position.distance_m(prior.position) / prior.radius_m.max(1.0)),
+        ] {
+            way.evidence.insert(name.into(), value);
+        }
+        if let Some(second) = way.evidence.get("second_peak").copied() {
+            way.evidence.insert("mode_share".into(), 1.0 / (1.0 + second));
+        }
+        steps.done("cues");
         if self.gates.enabled {
             judge_quad(&found.quad, self.bundle.manifest.frame_width_m, search.yaw_known, &self.gates)?;
             judge_distance(position.distance_m(prior.position), prior.radius_m)?;
             judge_map(map_valid, &self.gates)?;
             judge_evidence(&way.evidence, &self.gates)?;
         }
-        let agl_m = way_frame.agl_m;
-        Ok(self.fix(position, &found, &pose, agl_m, &mut way.evidence))
+        let judgement = judge_probability(self.bundle.manifest.integrity.as_ref(), &way.evidence, &self.gates)?;
+        // The calibration was made with a known yaw (a search of the circle tries thirty times as many hypotheses) and at
+        // the bundle's own scale.
+        let judgement = judgement.filter(|_| search.yaw_known && scale == 1.0);
+        let seen_as = Seeing { pose: &pose, agl_m: way_frame.agl_m, scale };
+        let fix = self.fix(position, &found, &seen_as, judgement, &mut way.evidence);
+        if let Some(sigma_m) = prior.sigma_m {
+            let variance_m2 = sigma_m * sigma_m + fix.covariance_enu_m2[0][0].max(fix.covariance_enu_m2[1][1]);
+            way.evidence.insert("prior_chi2".into(), position.distance_m(prior.position).powi(2) / variance_m2);
+        }
+        Ok(fix)
     }
 
     /// `no_prior` for a prior that is none, `prior_too_wide`.
@@ -183,6 +221,31 @@ impl Localizer {
         Ok(())
     }
 
+    /// `prior_too_wide` at the scale of this frame.
+    fn judge_scaled_prior(&self, prior: &Prior, scale: f64) -> Result<(), NoFix> {
+        let most_m = scale * self.bundle.manifest.search_radius_m;
+        if prior.radius_m <= most_m * (1.0 + RADIUS_SLACK) {
+            return Ok(());
+        }
+        let detail = format!(
+            "search radius: expected at most {most_m:.1} m (D_C of the bundle at {scale:.3} of its scale, for so low a frame), \
+             found {:.1} m",
+            prior.radius_m
+        );
+        Err(NoFix::new(Reason::PriorTooWide, detail))
+    }
+
+    /// The scale at which a frame is matched: 1, but less where its footprint is smaller than the bundle's and the bundle
+    /// supports it (`scale_range`). Then frame, window and D_C shrink together and the pixels stay as many.
+    fn scale_for(&self, footprint_m: Option<f64>) -> f64 {
+        let manifest = &self.bundle.manifest;
+        let (Some([least, _]), Some(footprint_m)) = (manifest.scale_range, footprint_m) else { return 1.0 };
+        let share = footprint_m / manifest.frame_width_m;
+        // In steps of 1/8 octave: a window is kept while the height varies a little.
+        let stepped = 2f64.powf((share.log2() * 8.0).floor() / 8.0);
+        if share >= FULL_FOOTPRINT || !stepped.is_finite() { 1.0 } else { stepped.clamp(least, 1.0) }
+    }
+
     /// Decode, tone mapping, rectification: `bad_frame`. Also the pose that was assumed.
     fn read_frame(&self, query: &Query<'_>, steps: &mut Steps) -> Result<(Rectified, Pose), NoFix> {
         let bad = |e: &dyn std::fmt::Display| NoFix::new(Reason::BadFrame, e.to_string());
@@ -198,14 +261,15 @@ impl Localizer {
         // With an unknown yaw the circle is searched from north up.
         let pose = Pose { yaw_deg: query.pose.yaw_deg.or(Some(0.0)), ..query.pose };
         let manifest = &self.bundle.manifest;
-        let frame = rectify(&gray, &pose, manifest.frame_px(), manifest.m_per_px).map_err(|e| bad(&e))?;
+        let scale = self.scale_for(pose.footprint_m(gray.width.min(gray.height), gray.width));
+        let frame = rectify(&gray, &pose, manifest.frame_px(), scale * manifest.m_per_px).map_err(|e| bad(&e))?;
         steps.done("rectify");
         Ok((frame, pose))
     }
 
     /// `off_map`.
-    fn judge_map_reach(&mut self, prior: &Prior) -> Result<(), NoFix> {
-        let side_m = self.bundle.manifest.frame_width_m;
+    fn judge_map_reach(&mut self, prior: &Prior, scale: f64) -> Result<(), NoFix> {
+        let side_m = scale * self.bundle.manifest.frame_width_m;
         let share = self.gates.min_map_valid;
         let held = self.windows.map.can_hold(prior.position, prior.radius_m, side_m, share);
         let held = held.map_err(|e| NoFix::new(Reason::OffMap, e.to_string()))?;
@@ -219,26 +283,72 @@ impl Localizer {
         Err(NoFix::new(Reason::OffMap, detail))
     }
 
-    fn fix(&self, position: LatLon, found: &PairMatch, pose: &Pose, agl_m: Option<f64>, evidence: &mut Evidence) -> Fix {
+    fn fix(
+        &self,
+        position: LatLon,
+        found: &PairMatch,
+        seeing: &Seeing<'_>,
+        judgement: Option<Judgement>,
+        evidence: &mut Evidence,
+    ) -> Fix {
         let manifest = &self.bundle.manifest;
         let last = match (&found.stage, &manifest.refine) {
             (StageName::Refine, Some(refine)) => refine,
             _ => &manifest.coarse,
         };
-        let error = budget::stated_error(&self.budget, last.match_sigma_m(), pose, agl_m, evidence);
+        let (match_sigma_m, tail999) = judgement.map_or((last.match_sigma_m(), 0.0), |j| (j.sigma_m, j.tail999));
+        let Seeing { pose, agl_m, scale } = *seeing;
+        if scale != 1.0 {
+            evidence.insert("matched_scale".into(), scale);
+        }
+        let error = budget::stated_error(&self.budget, match_sigma_m * scale, tail999, pose, agl_m, evidence);
         let found_as = similarity_of(manifest.frame_px(), &found.quad);
         Fix {
             position,
             covariance_enu_m2: error.covariance_enu_m2,
             radius95_m: error.radius95_m,
             radius999_m: error.radius999_m,
-            calibrated: false,
+            calibrated: judgement.is_some(),
+            p_over_25m: judgement.map(|j| j.p_over_bound),
             yaw_deg: (pose.yaw_deg.unwrap_or(0.0) + found_as.rotation_deg).rem_euclid(360.0),
             scale: found_as.scale,
             stage: found.stage,
-            homography: found.homography.0,
+            homography: homography_at_metres(&found.homography, scale, manifest.frame_px()).0,
         }
     }
+}
+
+/// How a frame was looked at.
+struct Seeing<'a> {
+    pose: &'a Pose,
+    agl_m: Option<f64>,
+    /// Of frame and window against the bundle's own.
+    scale: f64,
+}
+
+/// Share of the bundle's frame width from which on a footprint counts as whole.
+const FULL_FOOTPRINT: f64 = 0.8;
+
+/// An affine of window pixels at `scale` m/px as one of pixels at 1 m/px.
+fn affine_at_metres(affine: &[f64; 6], scale: f64) -> [f64; 6] {
+    let [a, b, c, d, e, f] = *affine;
+    // Pixel x at 1 m/px is (x + 0.5) / scale - 0.5 of the finer ones.
+    let shift = 0.5 / scale - 0.5;
+    [a / scale, b / scale, c + (a + b) * shift, d / scale, e / scale, f + (d + e) * shift]
+}
+
+/// A homography between squares at `scale` m/px as one between squares at 1 m/px: the frame's about its middle, the
+/// window's from its corner.
+fn homography_at_metres(found: &Homography, scale: f64, frame_px: usize) -> Homography {
+    if scale == 1.0 {
+        return *found;
+    }
+    let middle = (frame_px as f64 - 1.0) / 2.0;
+    let frame =
+        Homography([[1.0 / scale, 0.0, middle - middle / scale], [0.0, 1.0 / scale, middle - middle / scale], [0.0, 0.0, 1.0]]);
+    let shift = 0.5 * scale - 0.5;
+    let window = Homography([[scale, 0.0, shift], [0.0, scale, shift], [0.0, 0.0, 1.0]]);
+    window.after(&found.after(&frame))
 }
 
 /// What is known on the way, whichever gate closes.
@@ -277,6 +387,7 @@ fn check_settings(gates: &GateSettings, budget: &BudgetSettings) -> Result<(), L
         ("gates.min_frame_valid", gates.min_frame_valid),
         ("gates.min_side_ratio", gates.min_side_ratio),
         ("gates.min_peak_mass", gates.min_peak_mass),
+        ("gates.max_p_over_25m", gates.max_p_over_25m),
     ];
     let sizes = [
         ("gates.min_frame_std", gates.min_frame_std),
@@ -289,6 +400,8 @@ fn check_settings(gates: &GateSettings, budget: &BudgetSettings) -> Result<(), L
         ("budget.sigma_tilt_unknown_deg", budget.sigma_tilt_unknown_deg),
         ("budget.assumed_agl_m", budget.assumed_agl_m),
         ("budget.map_sigma_m", budget.map_sigma_m),
+        ("budget.sigma_stamp_s", budget.sigma_stamp_s),
+        ("budget.speed_mps", budget.speed_mps),
         ("budget.floor_m", budget.floor_m),
     ];
     for (field, found) in shares {

@@ -6,6 +6,9 @@
 mod answer;
 mod budget;
 mod correlate;
+mod crops;
+mod cues;
+mod cycle;
 mod gates;
 mod hypotheses;
 mod inputs;

@@ -45,6 +45,8 @@ pub struct Search {
     pub vehicle_px: [f64; 2],
     /// Whether the frame's yaw is known; else all of the circle is tried.
     pub yaw_known: bool,
+    /// Whether the refine stage also sees the frame with parts covered: evidence, for four more frames of its cost.
+    pub crops: bool,
 }
 
 impl Search {
@@ -52,7 +54,7 @@ impl Search {
     pub fn whole(manifest: &Manifest) -> Self {
         let middle = |px: usize| (px as f64 - 1.0) / 2.0;
         let (window, frame) = (middle(manifest.window_px()), middle(manifest.frame_px()));
-        Self { centre_px: [window; 2], radius_m: manifest.search_radius_m, vehicle_px: [frame; 2], yaw_known: true }
+        Self { centre_px: [window; 2], radius_m: manifest.search_radius_m, vehicle_px: [frame; 2], yaw_known: true, crops: false }
     }
 }
 
@@ -141,8 +143,12 @@ pub fn match_pair(
     };
     let refined = match crop.map(|crop| crop.shape) {
         None => None,
-        Some(CropShape::BoundingBox) => Some(stages::refine_bounding_box(bundle, window, frame, &coarse, &mut evidence, steps)?),
-        Some(CropShape::Oriented) => Some(stages::refine_oriented(bundle, window, frame, &coarse, &mut evidence, steps)?),
+        Some(CropShape::BoundingBox) => {
+            Some(stages::refine_bounding_box(bundle, window, frame, &coarse, search.crops, &mut evidence, steps)?)
+        }
+        Some(CropShape::Oriented) => {
+            Some(stages::refine_oriented(bundle, window, frame, &coarse, search.crops, &mut evidence, steps)?)
+        }
     };
     let (quad, stage) = refined.map_or((coarse, StageName::Coarse), |quad| (quad, StageName::Refine));
     // DLT: frame edges to the quad's edges give H; then Eq. (8) for any point of the frame.

@@ -36,6 +36,8 @@ pub struct Peak {
     pub entropy_bits: f64,
     /// Highest logit.
     pub peak_logit: f64,
+    /// Which hypothesis it is of.
+    pub hypothesis: usize,
 }
 
 /// Logits with what they are of.
@@ -113,7 +115,8 @@ impl Surface<'_> {
         }
         let entropy_bits = mass.iter().filter(|m| **m > 0.0).map(|m| -m * m.log2()).sum();
         let second_peak = second / peak_mass;
-        Some(Peak { shift, rotation_deg, scale, peak_mass, second_peak, entropy_bits, peak_logit: f64::from(highest) })
+        let peak_logit = f64::from(highest);
+        Some(Peak { shift, rotation_deg, scale, peak_mass, second_peak, entropy_bits, peak_logit, hypothesis: best_b })
     }
 
     fn rotation_and_scale(&self, best_b: usize, x: i64, y: i64) -> Option<(f64, f64)> {

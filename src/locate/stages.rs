@@ -2,6 +2,8 @@
 
 use super::Evidence;
 use super::correlate::{Correlator, ShiftRange};
+use super::crops;
+use super::cycle::cycle;
 use super::hypotheses::{Turner, batch, hypotheses};
 use super::inputs::{FrameView, WindowView};
 use super::pair::{PairError, Search, Steps, similarity_of};
@@ -62,13 +64,15 @@ pub fn coarse_matcher(
     let stage = matcher_of(Some(&bundle.manifest.coarse), "coarse")?;
     let input = frame.input(&stage.frame);
     steps.done("coarse_input");
-    let displacement = run_matcher(&mut bundle.coarse, features, &input, stage.map.m_per_px(), "coarse", evidence)?;
+    let found = run_matcher(&mut bundle.coarse, features, &input, stage.map.m_per_px(), "coarse", evidence)?;
+    let displacement = first(&found, "coarse: displacement")?;
     steps.done("coarse");
     // D' = alpha D, below Eq. (3).
     Ok(box_of_inclusive(&Quad::displaced(stage.map.size_px as usize, &displacement), stage.map.m_per_px()))
 }
 
-/// Runs a matcher graph; `m_per_px` of its map input turns pixels of evidence into metres.
+/// Runs a matcher graph, a displacement for every frame of the batch; evidence is that of the first. `m_per_px` of the map
+/// input turns pixels of evidence into metres.
 fn run_matcher(
     graph: &mut Graph,
     features: &Tensor,
@@ -76,43 +80,53 @@ fn run_matcher(
     m_per_px: f64,
     stage: &'static str,
     evidence: &mut Evidence,
-) -> Result<Displacement, PairError> {
+) -> Result<Vec<Displacement>, PairError> {
     let mut outputs = graph.run(&[("map_features", features), ("frame", frame)])?;
     let two = Dim::Exact(2);
-    let tensor = outputs.take("displacement", &[Dim::Exact(1), two, two, two])?;
-    let mut displacement = Displacement::default();
-    for (to, from) in displacement.iter_mut().flatten().flatten().zip(&tensor.data) {
-        if !from.is_finite() {
-            return Err(PairError::NonFinite { what: "displacement", found: from.to_string() });
-        }
-        *to = f64::from(*from);
+    let batch = frame.shape.first().copied().unwrap_or(0);
+    let tensor = outputs.take("displacement", &[Dim::Exact(batch), two, two, two])?;
+    if let Some(bad) = tensor.data.iter().find(|v| !v.is_finite()) {
+        return Err(PairError::NonFinite { what: "displacement", found: bad.to_string() });
     }
-    gather_evidence(&outputs, m_per_px, stage, evidence);
-    Ok(displacement)
+    let one = |values: &[f32]| {
+        let mut displacement = Displacement::default();
+        displacement.iter_mut().flatten().flatten().zip(values).for_each(|(to, from)| *to = f64::from(*from));
+        displacement
+    };
+    gather_evidence(&outputs, batch, m_per_px, stage, evidence);
+    Ok(tensor.data.chunks_exact(8).map(one).collect())
 }
 
-/// Optional outputs: `residual` `[1]` (weighted RMS residual of the patches, px), `weight` `[1]` (their total weight),
-/// `covariance` `[1, 4, 4]` (of the corner displacements per axis, px^2), `iterations` `[1, K, 2, 2, 2]` (cumulative
-/// displacements; the size of the last step tells whether they settled). What is not finite is left out.
-fn gather_evidence(outputs: &Outputs, m_per_px: f64, stage: &str, evidence: &mut Evidence) {
+/// The first displacement of a batch.
+fn first(found: &[Displacement], what: &'static str) -> Result<Displacement, PairError> {
+    found.first().copied().ok_or(PairError::NonFinite { what, found: "an empty batch".into() })
+}
+
+/// Optional outputs, of the first frame of the batch: `residual` `[B]` (weighted RMS residual of the patches, px), `weight`
+/// `[B]` (their total weight), `covariance` `[B, 4, 4]` (of the corner displacements per axis, px^2), `iterations`
+/// `[K, B, 2, 2, 2]` (cumulative displacements; the size of the last step tells whether they settled). What is not finite
+/// is left out.
+fn gather_evidence(outputs: &Outputs, batch: usize, m_per_px: f64, stage: &str, evidence: &mut Evidence) {
     let mut put = |name: &str, value: f64| {
         if value.is_finite() {
             evidence.insert(format!("{stage}_{name}"), value);
         }
     };
-    if let Some([residual]) = outputs.get("residual").map(|t| &t.data[..]) {
+    let per_frame = |name: &str| outputs.get(name).filter(|t| t.data.len() == batch).and_then(|t| t.data.first());
+    if let Some(residual) = per_frame("residual") {
         put("residual_m", f64::from(*residual) * m_per_px);
     }
-    if let Some([weight]) = outputs.get("weight").map(|t| &t.data[..]) {
+    if let Some(weight) = per_frame("weight") {
         put("weight", f64::from(*weight));
     }
-    if let Some(covariance) = outputs.get("covariance").filter(|t| t.data.len() == 16) {
+    if let Some(covariance) = outputs.get("covariance").filter(|t| t.data.len() == 16 * batch) {
         // The middle moves by the mean of the corners: variance 1' C 1 / 16.
-        let variance_px2 = covariance.data.iter().map(|v| f64::from(*v)).sum::<f64>() / 16.0;
+        let variance_px2 = covariance.data.iter().take(16).map(|v| f64::from(*v)).sum::<f64>() / 16.0;
         put("match_sigma_m", variance_px2.max(0.0).sqrt() * m_per_px);
     }
-    if let Some(iterations) = outputs.get("iterations").filter(|t| t.data.len() >= 16 && t.data.len() % 8 == 0) {
-        let mut ends = iterations.data.rchunks_exact(8);
+    let steps = outputs.get("iterations").filter(|t| batch > 0 && t.data.len() % (8 * batch) == 0);
+    if let Some(iterations) = steps {
+        let mut ends = iterations.data.rchunks_exact(8 * batch);
         if let (Some(end), Some(before)) = (ends.next(), ends.next()) {
             let step = |i: usize| match (end.get(i), before.get(i), end.get(i + 4), before.get(i + 4)) {
                 (Some(x1), Some(x0), Some(y1), Some(y0)) => f64::from(x1 - x0).hypot(f64::from(y1 - y0)),
@@ -167,6 +181,14 @@ pub fn coarse_correlation(
     let peak = peak.ok_or_else(|| PairError::NonFinite { what: "log-posterior", found: "a logit that is not finite".into() })?;
     steps.done("correlate");
     put_peak(&peak, evidence);
+    let features = encoded.get(peak.hypothesis / MAX_BATCH);
+    let item = correlator.map().shape.get(1).map_or(0, |channels| channels * geometry.frame_cells * geometry.frame_cells);
+    let own = features.and_then(|f| f.data.chunks_exact(item.max(1)).nth(peak.hypothesis % MAX_BATCH));
+    if let Some(back) = own.and_then(|own| cycle(correlator.map(), own, geometry.frame_cells, peak.shift)) {
+        evidence.insert("cycle_m".into(), back.distance_cells * geometry.cell_m);
+        evidence.insert("cycle_mass".into(), back.mass);
+    }
+    steps.done("cycle");
     let similarity = Similarity { centre_px: geometry.place(peak.shift), rotation_deg: peak.rotation_deg, scale: peak.scale };
     Ok(similarity.quad(bundle.manifest.frame_px()))
 }
@@ -256,6 +278,7 @@ pub fn refine_bounding_box(
     window: &WindowView<'_>,
     frame: &FrameView<'_>,
     coarse: &Quad,
+    crops: bool,
     evidence: &mut Evidence,
     steps: &mut Steps,
 ) -> Result<Quad, PairError> {
@@ -275,7 +298,7 @@ pub fn refine_bounding_box(
     let step = (width - 1.0) / (n as f64 - 1.0);
     let crop = crop_bilinear(&window.sampler(), start[0] + margin, start[1] + margin, step, n);
     let eta = width / n as f64;
-    let quad = refine(bundle, Tensor { shape: vec![1, 3, n, n], data: crop }, frame, eta, evidence, steps)?;
+    let quad = refine(bundle, Tensor { shape: vec![1, 3, n, n], data: crop }, frame, eta, crops, evidence, steps)?;
     // D_S->T = D_S->B + eta D_RB->RT, Eq. (7), as edges.
     Ok(Quad(box_of_inclusive(&quad, eta).0.map(|[x, y]| [x + start[0], y + start[1]])))
 }
@@ -290,6 +313,7 @@ pub fn refine_oriented(
     window: &WindowView<'_>,
     frame: &FrameView<'_>,
     coarse: &Quad,
+    crops: bool,
     evidence: &mut Evidence,
     steps: &mut Steps,
 ) -> Result<Quad, PairError> {
@@ -305,7 +329,7 @@ pub fn refine_oriented(
     // Nominal, not times the coarse scale: the rule must not change between frames.
     let samples = m_per_px.round_ties_even().clamp(1.0, 16.0) as usize;
     let crop = sample_grid(&window.sampler(), n, samples, place);
-    let quad = refine(bundle, Tensor { shape: vec![1, 3, n, n], data: crop }, frame, m_per_px, evidence, steps)?;
+    let quad = refine(bundle, Tensor { shape: vec![1, 3, n, n], data: crop }, frame, m_per_px, crops, evidence, steps)?;
     // Edges in crop px at 1 frame metre, then through the similarity: H = similarity after the fine homography.
     let side_middle = n as f64 * m_per_px / 2.0 - 0.5;
     Ok(Quad(box_of_inclusive(&quad, m_per_px).0.map(|[x, y]| similarity.apply(x - side_middle, y - side_middle))))
@@ -317,6 +341,7 @@ fn refine(
     crop: Tensor,
     frame: &FrameView<'_>,
     m_per_px: f64,
+    with_crops: bool,
     evidence: &mut Evidence,
     steps: &mut Steps,
 ) -> Result<Quad, PairError> {
@@ -330,7 +355,14 @@ fn refine(
     let mut outputs = map_graph.run(&[("map", &crop)])?;
     let features = outputs.take("map_features", &[Dim::Exact(1), Dim::Any, Dim::Any, Dim::Any])?;
     steps.done("refine_map");
-    let displacement = run_matcher(graph, &features, &input, m_per_px, "refine", evidence)?;
+    let five = with_crops.then(|| crops::batch(&input)).flatten();
+    let found = run_matcher(graph, &features, five.as_ref().unwrap_or(&input), m_per_px, "refine", evidence)?;
+    let displacement = first(&found, "refine: displacement")?;
+    if five.is_some() {
+        let spread = crops::spread(&found);
+        evidence.insert("crop_spread_m".into(), spread.corners_px * m_per_px);
+        evidence.insert("crop_middle_spread_m".into(), spread.middle_px * m_per_px);
+    }
     steps.done("refine");
     Ok(Quad::displaced(stage.map.size_px as usize, &displacement))
 }

@@ -7,6 +7,7 @@
 //! * `graph` of a correlation: input `frame` -> output `frame_features`, already weighted, so that the plain
 //!   cross-correlation with `map_features` is a logit.
 
+use super::Integrity;
 use serde::{Deserialize, Serialize};
 
 /// A model bundle's manifest.
@@ -44,6 +45,11 @@ pub struct Manifest {
     pub refine: Option<StageManifest>,
     /// What was measured, and on what.
     pub accuracy: Option<Accuracy>,
+    /// Least and largest factor by which frame, window and D_C may all be scaled together, the pixels staying as many: low
+    /// flights over finer maps. Absent: not scaled.
+    pub scale_range: Option<[f64; 2]>,
+    /// What the evidence is worth; absent: uncalibrated.
+    pub integrity: Option<Integrity>,
 }
 
 /// Where weights come from.

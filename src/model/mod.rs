@@ -7,6 +7,7 @@ mod bundle;
 mod file;
 mod golden;
 mod graph;
+mod integrity;
 mod manifest;
 mod npy;
 mod runtime;
@@ -16,6 +17,7 @@ mod validate;
 pub use bundle::{Bundle, BundleError, GoldenDifference};
 pub use golden::Golden;
 pub use graph::{Dim, Graph, GraphError, Outputs, Port, Tensor};
+pub use integrity::{Cue, Integrity, Judgement, Knots, MissingCue, Sigma, Transform};
 pub use manifest::{
     Accuracy, Content, CorrelationStage, Crop, CropShape, FileRef, InputSpec, Lookup, Manifest, MatcherStage, Provenance, Resize,
     StageManifest,

@@ -129,6 +129,13 @@ impl Manifest {
             Some(StageManifest::Matcher(stage)) => self.check_matcher(&c, "refine", stage)?,
             Some(StageManifest::Correlation(_)) => return Err(c.error("refine.kind", "matcher", "correlation")),
         }
+        if let Some([least, most]) = self.scale_range {
+            c.within("scale_range[0]", least, 0.01, 1.0)?;
+            c.within("scale_range[1]", most, 1.0, 100.0)?;
+        }
+        if let Some((field, expected, found)) = self.integrity.as_ref().and_then(super::Integrity::fault) {
+            return Err(c.error(&format!("integrity.{field}"), expected, found));
+        }
         Ok(())
     }
 

@@ -64,6 +64,14 @@ impl CameraModel {
 }
 
 impl Pose {
+    /// Ground under `side_px` pixels at nadir, metres, of a frame `width_px` wide; `None` where height and field of view do
+    /// not say.
+    pub fn footprint_m(&self, side_px: u32, width_px: u32) -> Option<f64> {
+        let width_m = || Some(2.0 * self.agl_m? * (self.hfov_deg? / 2.0).to_radians().tan());
+        let gsd_m = self.gsd_m.or_else(|| Some(width_m()? / f64::from(width_px)))?;
+        Some(gsd_m * f64::from(side_px))
+    }
+
     /// Whether every known number is finite and within what can be flown.
     pub(super) fn check(&self) -> Result<(), FrameError> {
         for (name, value, least, most) in [

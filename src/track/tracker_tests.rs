@@ -29,7 +29,7 @@ fn sigma(stamp_ns: i64, east_m: f64, sigma_m: f64) -> PriorReport {
 }
 
 fn answer(outcome: Result<Fix, NoFix>, prior: Option<Prior>) -> Answer {
-    Answer { outcome, prior, window: None, evidence: BTreeMap::new(), latency_ms: BTreeMap::new() }
+    Answer { outcome, prior, searched: false, window: None, evidence: BTreeMap::new(), latency_ms: BTreeMap::new() }
 }
 
 fn fix(east_m: f64, sigma_m: f64, prior: Option<Prior>) -> Answer {
@@ -40,6 +40,7 @@ fn fix(east_m: f64, sigma_m: f64, prior: Option<Prior>) -> Answer {
         radius95_m: 1.0,
         radius999_m: 1.0,
         calibrated: false,
+        p_over_25m: None,
         yaw_deg: 0.0,
         scale: 1.0,
         stage: StageName::Refine,

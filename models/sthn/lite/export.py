@@ -129,7 +129,7 @@ def coarse_stage(folder: Path, picture: np.ndarray, frame: np.ndarray) -> Export
 def refine_stage(folder: Path, picture: np.ndarray, frame: np.ndarray) -> Exported:
     """The matcher stage."""
     net = load(folder, refine.RefineNet(REFINE.map_px, REFINE.frame_px))
-    named = ["displacement", "residual", "weight", "covariance"]
+    named = ["displacement", "residual", "weight", "covariance", "iterations"]
     with torch.no_grad():
         features = net.encode_map(torch.rand(1, 3, REFINE.map_px, REFINE.map_px))
     example = torch.rand(1, 2, REFINE.frame_px, REFINE.frame_px)
@@ -140,7 +140,7 @@ def refine_stage(folder: Path, picture: np.ndarray, frame: np.ndarray) -> Export
             refine.Matcher(net),
             {"map_features": features, "frame": example},
             named,
-            {name: {0: "batch"} for name in ["frame", *named]},
+            {name: {1 if name == "iterations" else 0: "batch"} for name in ["frame", *named]},
         ),
     }
     table = {

@@ -270,19 +270,22 @@ class MapSide(nn.Module):
 
 
 class Matcher(nn.Module):
-    """`map_features`, `frame` -> `displacement`, `residual` (crop pixels), `weight`, `covariance` (per axis, px^2)."""
+    """`map_features`, `frame` -> `displacement`, `residual` (crop pixels), `weight`, `covariance` (per axis, px^2) and
+    `iterations` `[K, B, 2, 2, 2]`, the cumulative displacements level by level."""
 
     def __init__(self, net: RefineNet):
         super().__init__()
         self.net = net
 
-    def forward(self, map_features: Tensor, frame: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        last = self.net(map_features, frame)[-1]
+    def forward(self, map_features: Tensor, frame: Tensor) -> tuple[Tensor, ...]:
+        steps = self.net(map_features, frame)
+        last = steps[-1]
         eye = torch.eye(4, device=frame.device).expand(frame.shape[0], 4, 4)
         inverse = solve4(last.normal, eye)
         covariance = inverse * (last.residual * last.residual)[:, None, None]
         weight = torch.diagonal(last.normal, dim1=1, dim2=2).sum(1)
-        return self.net.displacement(last.corners), last.residual, weight, covariance
+        iterations = torch.stack([self.net.displacement(step.corners) for step in steps])
+        return iterations[-1], last.residual, weight, covariance, iterations
 
 
 def loss_of(net: RefineNet, steps: list[Step], truth: Tensor, gamma: float = 0.85) -> tuple[Tensor, Tensor]:
