@@ -30,7 +30,7 @@ class Match:
     """What a rival says of a pair."""
 
     homography: NDArray[np.float64] | None
-    """`[3, 3]`: frame px -> window px, both at 1 m/px, integers at pixel centres; None where it failed."""
+    """`[3, 3]`: frame px -> window px, integers at pixel centres; None where it failed."""
     seconds: float
     detail: dict[str, float | int | str] = field(default_factory=dict)
     """What speaks for it (matches, inliers), or why it failed (`failure`)."""
@@ -47,7 +47,7 @@ class Rival(Protocol):
     name: str
     """As the tables print it."""
     window_m: int | None
-    """The only W_S it works at; None for any."""
+    """The only W_S it works at, metres of ground; None for any."""
     note: str
     """Stands beside its row: "short run, 400 steps", "no weights here"; empty where there is nothing to add."""
     ready: bool
@@ -72,10 +72,15 @@ class Unready:
         raise RivalError(f"{self.name}: cannot match {pair.name}: {self.note}")
 
 
+def ground_m(pair: Pair) -> int:
+    """W_S on the ground."""
+    return round(pair.window_m * pair.m_per_px)
+
+
 def check_window(rival: Rival, pair: Pair) -> None:
     """A window of another width is an error, not a bad answer."""
-    if rival.window_m is not None and pair.window_m != rival.window_m:
-        raise RivalError(f"{rival.name}: pair {pair.name}: expected a window of {rival.window_m} m, found {pair.window_m} m")
+    if rival.window_m is not None and ground_m(pair) != rival.window_m:
+        raise RivalError(f"{rival.name}: pair {pair.name}: expected a window of {rival.window_m} m, found {ground_m(pair)} m")
 
 
 def translation(x: float, y: float) -> NDArray[np.float64]:

@@ -13,10 +13,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from . import classic
+from . import classic, learned
 from .base import Rival, RivalError
 
 Factory = Callable[[Path | None], Rival]
+
+
+def _learned(key: str) -> Factory:
+    return lambda path: learned.load(key, path)
 
 
 def _classic(detector: str, estimator: str) -> Factory:
@@ -26,6 +30,7 @@ def _classic(detector: str, estimator: str) -> Factory:
 FACTORIES: dict[str, Factory] = {
     "identity": lambda _path: classic.Identity(),
     **{f"{d}+{e}": _classic(d, e) for d in classic.DETECTORS for e in classic.ESTIMATORS},
+    **{key: _learned(key) for key in learned.NETWORKS},
 }
 """Name -> the rival, given the path of its weights or None. In the order of the paper's Table I, then Table II."""
 
