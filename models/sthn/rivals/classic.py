@@ -56,7 +56,7 @@ class Identity:
 
 
 def robust_homography(
-    source: NDArray[np.float64], target: NDArray[np.float64], method: int
+    source: NDArray[np.float64], target: NDArray[np.float64], method: int, threshold_px: float = REPROJECTION_PX
 ) -> tuple[NDArray[np.float64] | None, dict[str, float | int | str]]:
     """Point pairs `[N, 2]` (frame px, window px) -> a homography, or None with `failure` in the detail."""
     detail: dict[str, float | int | str] = {"matches": len(source)}
@@ -66,7 +66,7 @@ def robust_homography(
         np.ascontiguousarray(source, np.float64),
         np.ascontiguousarray(target, np.float64),
         method,
-        REPROJECTION_PX,
+        threshold_px,
         maxIters=ITERATIONS,
         confidence=CONFIDENCE,
     )

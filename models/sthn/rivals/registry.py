@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from . import classic, learned
+from . import classic, learned, loftr, r2d2, retrieval
 from .base import Rival, RivalError
 
 Factory = Callable[[Path | None], Rival]
@@ -30,7 +30,12 @@ def _classic(detector: str, estimator: str) -> Factory:
 FACTORIES: dict[str, Factory] = {
     "identity": lambda _path: classic.Identity(),
     **{f"{d}+{e}": _classic(d, e) for d in classic.DETECTORS for e in classic.ESTIMATORS},
+    "r2d2": r2d2.load,
+    "loftr": loftr.load,
     **{key: _learned(key) for key in learned.NETWORKS},
+    "anyloc": retrieval.load_anyloc,
+    "stgl-netvlad": lambda path: retrieval.load_stgl("netvlad", path),
+    "stgl-gem": lambda path: retrieval.load_stgl("gem", path),
 }
 """Name -> the rival, given the path of its weights or None. In the order of the paper's Table I, then Table II."""
 
