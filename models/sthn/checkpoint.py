@@ -57,6 +57,12 @@ def one_stage(network: Sthn) -> Sthn:
     return alone.train(network.training)
 
 
+def read_state(path: str | Path) -> dict[str, Tensor]:
+    """The weights of a checkpoint in either layout, keys with stage prefix."""
+    path = Path(path)
+    return _read_directory(path) if path.is_dir() else _read_pth(path)
+
+
 def load_state(network: Sthn, state: dict[str, Tensor], name: str) -> None:
     """Copies `state` (keys with stage prefix) into `network`; every key of either must be in the other."""
     wanted = network.state_dict()

@@ -35,8 +35,13 @@ class Matcher(nn.Module):
 
         A displacement that makes three corners collinear gives numbers that are not finite, and so does every later
         iteration: the caller sees them (the published code silently drops such an increment).
+
+        Under autocast only convolutions run in half precision, as published: half a correlation or a displacement would
+        cost pixels.
         """
-        pyramid = correlation_pyramid(map_features, frame_features, self.levels, self.lookup)
+        map_features, frame_features = single(map_features), single(frame_features)
+        with torch.autocast(frame_features.device.type, enabled=False):
+            pyramid = correlation_pyramid(map_features, frame_features, self.levels, self.lookup)
         grid = identity_grid(self.feature_side, frame_features)
         displacement = torch.zeros_like(frame_features[:, :8, 0, 0]).unflatten(1, (2, 2, 2))
         coordinates = grid.expand(frame_features.shape[0], -1, -1, -1)
@@ -45,10 +50,15 @@ class Matcher(nn.Module):
             if iteration > 0:
                 coordinates = lookup_coordinates(feature_homography(displacement, self.feature_side), grid, self.lookup)
             # D_{k+1} = D_k + Delta D_k                                                              (2)
-            displacement = displacement + self.update_block_4(look_up(pyramid, coordinates), coordinates - grid)
+            displacement = displacement + single(self.update_block_4(look_up(pyramid, coordinates), coordinates - grid))
             cumulative.append(displacement)
         return torch.stack(cumulative)
 
     def forward(self, map_image: Tensor, frame_image: Tensor) -> Tensor:
         """Both images `[B, 3, W_R, W_R]` in 0..1 -> `[K, B, 2, 2, 2]`."""
         return self.match(self.encode(map_image), self.encode(frame_image))
+
+
+def single(x: Tensor) -> Tensor:
+    """Half precision made single; anything else as it is."""
+    return x.float() if x.dtype in (torch.bfloat16, torch.float16) else x

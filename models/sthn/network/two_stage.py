@@ -7,6 +7,7 @@ window.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -106,15 +107,19 @@ class Sthn(nn.Module):
         self.netG = Matcher(config.resize_width, config.corr_level, config.iters_lev0, lookup)
         self.netG_fine = Matcher(config.resize_width, FINE_LEVELS, config.iters_lev1, lookup) if config.two_stages else None
 
-    def forward(self, window: Tensor, thermal: Tensor) -> Match:
-        """`window`: `[B, 3, W_S, W_S]` in 0..1; `thermal`: `[B, 3, H, H]` in 0..1, covering the frame's square."""
+    def forward(self, window: Tensor, thermal: Tensor, box_of: Callable[[Tensor], Box] | None = None) -> Match:
+        """`window`: `[B, 3, W_S, W_S]` in 0..1; `thermal`: `[B, 3, H, H]` in 0..1, covering the frame's square.
+
+        `box_of`: coarse displacement -> box B, where it is not `bounding_box`: training moves and widens it.
+        """
         side = self.config.resize_width
         satellite, thermal = resize_satellite(window, side), resize_thermal(thermal, side)
         coarse = self.netG(satellite, thermal)
         if self.netG_fine is None:
             return Match(satellite, thermal, coarse, None, None, None, coarse[-1])
         # The box is not differentiated: each stage learns from its own loss.
-        box = bounding_box(coarse[-1].detach(), self.config)
+        last = coarse[-1].detach()
+        box = bounding_box(last, self.config) if box_of is None else box_of(last)
         cut = crop(window, box, side)
         fine = self.netG_fine(cut, thermal)
         return Match(satellite, thermal, coarse, box, cut, fine, combine(fine[-1], box, self.config))

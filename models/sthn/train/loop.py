@@ -1,0 +1,234 @@
+"""The training loop: AdamW, a one-cycle schedule, each net's gradient clipped apart; on CPU, one GPU or several.
+
+Everything random is a function of the seed and the step (`stream.py`, `box.py`), so that a checkpoint holds no state of a
+generator, and a training that goes on equals one that never stopped.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning_fabric import Fabric
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from .. import geometry
+from ..data.pair import PairSource, TrainingSource
+from . import box, pictures, saving
+from .experiment import Experiment
+from .stream import Fixed, Steps, Stream, loader
+
+SCHEDULE_SPARE = 100
+"""The published schedule is that much longer than the training."""
+
+SHEET_PAIRS = 4
+
+CURVE = ("step", "seconds", "lr", "loss", "loss_coarse", "loss_fine", "mace_coarse_m", "mace_m")
+VALIDATION = ("step", "seconds", "identity_m", "mace_coarse_m", "mace_m")
+
+
+class Loop:
+    """A training in a folder. `task`: see `task.Task`; `m_per_px`: of the windows, for curves in metres."""
+
+    def __init__(
+        self,
+        task: nn.Module,
+        experiment: Experiment,
+        train: TrainingSource,
+        validation: PairSource,
+        extended: TrainingSource | None,
+        out: Path,
+        fabric: Fabric,
+    ) -> None:
+        self.experiment, self.out, self.fabric = experiment, Path(out), fabric
+        self.table = experiment.training
+        self.task = task
+        self.side_px = experiment.network.resize_width
+        self.stream = Stream(train, extended, experiment.seed, self.side_px)
+        self.validation = Fixed(validation, self.side_px)
+        first = validation[0]
+        self.m_per_network_px = first.m_per_px * first.window_m / self.side_px
+        optimiser = torch.optim.AdamW(
+            task.parameters(), lr=self.table.peak_lr, weight_decay=self.table.weight_decay, eps=self.table.eps
+        )
+        self.module, self.optimiser = fabric.setup(task, optimiser)
+        self.schedule = torch.optim.lr_scheduler.OneCycleLR(
+            self.optimiser.optimizer,
+            max_lr=self.table.peak_lr,
+            total_steps=self.table.steps + SCHEDULE_SPARE,
+            pct_start=self.table.warm_up,
+            cycle_momentum=False,
+            anneal_strategy="linear",
+        )
+        self.step, self.spent_s, self.best_m = 0, 0.0, float("inf")
+
+    def resume(self, path: Path) -> None:
+        """Goes on from a checkpoint."""
+        state = saving.load(path)
+        self.task.load_state_dict(state["task"])
+        self.optimiser.optimizer.load_state_dict(state["optimiser"])
+        self.schedule.load_state_dict(state["schedule"])
+        self.step, self.spent_s, self.best_m = state["step"], state["spent_s"], state["best_m"]
+
+    def _state(self, seconds: float) -> dict[str, Any]:
+        return {
+            "task": self.task.state_dict(),
+            "optimiser": self.optimiser.optimizer.state_dict(),
+            "schedule": self.schedule.state_dict(),
+            "step": self.step,
+            "spent_s": seconds,
+            "best_m": self.best_m,
+        }
+
+    def run(self) -> None:
+        """Trains to the end."""
+        chief = self.fabric.is_global_zero
+        if chief:
+            self.out.mkdir(parents=True, exist_ok=True)
+            text = json.dumps(dataclasses.asdict(self.experiment), indent=2)
+            (self.out / "experiment.json").write_text(text + "\n", encoding="utf-8")
+            for name, columns in (("curve.csv", CURVE), ("validation.csv", VALIDATION)):
+                _keep_rows(self.out / name, columns, self.step)
+        steps = Steps(self.step, self.table.steps, self.table.batch, self.fabric.global_rank, self.fabric.world_size)
+        batches = loader(self.stream, steps, self.table.workers)
+        batches = self.fabric.setup_dataloaders(batches, use_distributed_sampler=False)
+        began, sums, counted = time.monotonic(), dict.fromkeys(CURVE[3:], 0.0), 0
+        bar = tqdm(total=self.table.steps, initial=self.step, mininterval=2, file=sys.stderr, disable=None if chief else True)
+        with bar:
+            for window, thermal, truth in batches:
+                lr = self.schedule.get_last_lr()[0]
+                found = self._train_step(window, thermal, truth)
+                bar.update()
+                for key, value in self._columns(found, truth).items():
+                    sums[key] += value
+                counted += 1
+                seconds = self.spent_s + time.monotonic() - began
+                last = self.step == self.table.steps
+                if self.step % self.table.log_every == 0 or last:
+                    row = {key: value / counted for key, value in sums.items()}
+                    bar.set_postfix(mace_m=f"{row['mace_m']:.2f}")
+                    if chief:
+                        _append(self.out / "curve.csv", [self.step, f"{seconds:.1f}", f"{lr:.4g}", *_numbers(row.values())])
+                    sums, counted = dict.fromkeys(sums, 0.0), 0
+                if self.step % self.table.validate_every == 0 or last:
+                    self._validate(seconds)
+                if chief and (self.step % self.table.picture_every == 0 or last):
+                    self._picture()
+                if chief and (self.step % self.table.save_every == 0 or last):
+                    path = self.out / f"checkpoints/step-{self.step:08}.pt"
+                    saving.write_atomically(self._state(self.spent_s + time.monotonic() - began), path)
+        if chief:
+            self._release("final")
+            saving.save_pth(self.task.nets(), self.out / "STHN.pth")
+
+    def _train_step(self, window: Tensor, thermal: Tensor, truth: Tensor) -> dict[str, Tensor]:
+        self.module.train()
+        # One generator a step and process: nothing of it has to be kept.
+        words = np.random.SeedSequence([self.experiment.seed, self.step, self.fabric.global_rank, 2])
+        generator = torch.Generator().manual_seed(int(words.generate_state(1, np.uint64)[0] >> 1))
+        drawn = box.draw(self.experiment.box, window.shape[0], generator).to(truth.device)
+        found = self.module(window, thermal, truth, drawn)
+        if not torch.isfinite(found["loss"]):
+            raise FloatingPointError(f"step {self.step}: loss: expected a finite number, found {found['loss'].item()}")
+        self.optimiser.zero_grad()
+        self.fabric.backward(found["loss"])
+        for net in self.task.nets().values():
+            nn.utils.clip_grad_norm_(net.parameters(), self.table.clip)
+        self.optimiser.step()
+        self.schedule.step()
+        self.step += 1
+        return found
+
+    def _columns(self, found: dict[str, Tensor], truth: Tensor) -> dict[str, float]:
+        """What the curve tells of a batch: losses in network px, MACE in metres."""
+        losses = {key: found[key].item() for key in ("loss", "loss_coarse", "loss_fine") if key in found}
+        final = self._mace_m(found["final"], truth)
+        coarse = self._mace_m(found["coarse"], truth) if "coarse" in found else final
+        return losses | {"mace_m": final.mean().item(), "mace_coarse_m": coarse.mean().item()}
+
+    def _mace_m(self, displacement: Tensor, truth: Tensor) -> Tensor:
+        """Mean distance of the four corners, metres, `[B]`: network px times alpha."""
+        return (displacement.detach() - truth).norm(dim=1).flatten(1).mean(1) * self.m_per_network_px
+
+    @torch.no_grad()
+    def _validate(self, seconds: float) -> None:
+        """MACE on the validation pairs, without any augmentation; the best one so far is released."""
+        self.module.eval()
+        rank, world = self.fabric.global_rank, self.fabric.world_size
+        mine = list(range(rank, len(self.validation), world))
+        size = max(1, self.table.batch // world)
+        chunks = [mine[i : i + size] for i in range(0, len(mine), size)]
+        sums = torch.zeros(4, dtype=torch.float64)
+        batches = self.fabric.setup_dataloaders(
+            loader(self.validation, chunks, self.table.workers), use_distributed_sampler=False
+        )
+        for window, thermal, truth in batches:
+            found = self.module(window, thermal, truth)
+            values = [torch.zeros_like(truth), found.get("coarse", found["final"]), found["final"]]
+            sums[:3] += torch.stack([self._mace_m(v, truth).sum() for v in values]).double().cpu()
+            sums[3] += len(truth)
+        sums = self.fabric.all_reduce(sums, reduce_op="sum").cpu()
+        means = (sums[:3] / sums[3]).tolist()
+        if self.fabric.is_global_zero:
+            _append(self.out / "validation.csv", [self.step, f"{seconds:.1f}", *_numbers(means)])
+            if means[2] < self.best_m:
+                self._release("best")
+        self.best_m = min(self.best_m, means[2])
+
+    @torch.no_grad()
+    def _picture(self) -> None:
+        """A sheet of the first validation pairs."""
+        self.task.eval()
+        source, panels = self.validation.source, []
+        for index in range(min(SHEET_PAIRS, len(source))):
+            pair = source[index]
+            one = [t[None].to(self.fabric.device) for t in self.validation[index]]
+            found = self.task(*one)
+            quads = [(pair.quad(), pictures.GREEN)]
+            for key, colour in (("coarse", pictures.BLUE), ("final", pictures.RED)):
+                if key in found:
+                    corners = geometry.displaced(self.side_px, found[key][0].double().cpu().numpy())
+                    quads.append((geometry.edges_of_inclusive(corners, pair.window_m / self.side_px), colour))
+            panels.append(pictures.panel(pair.satellite, pair.thermal, quads))
+        pictures.sheet(self.out / f"pictures/step-{self.step:08}.jpg", panels)
+
+    def _release(self, name: str) -> None:
+        network = getattr(self.task, "network", None)
+        if network is not None:
+            saving.save_released(network, self.out / name)
+        else:
+            saving.write_atomically({key: net.state_dict() for key, net in self.task.nets().items()}, self.out / f"{name}.pth")
+
+
+def make_fabric(precision: str, accelerator: str = "auto", devices: str | int = 1, strategy: str = "auto") -> Fabric:
+    """Fabric, started. Several devices: data parallel, every process with its share of each batch."""
+    # Deterministic matrix products on CUDA need this before the first of them.
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    fabric = Fabric(accelerator=accelerator, devices=devices, strategy=strategy, precision=precision)
+    fabric.launch()
+    return fabric
+
+
+def _numbers(values: Any) -> list[str]:
+    return [f"{value:.5f}" for value in values]
+
+
+def _append(path: Path, row: list[Any]) -> None:
+    with path.open("a", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerow(row)
+
+
+def _keep_rows(path: Path, columns: tuple[str, ...], step: int) -> None:
+    """The head and the rows up to `step`: what a stopped run wrote after its checkpoint is written again."""
+    lines = path.read_text(encoding="utf-8").splitlines()[1:] if path.exists() and step else []
+    kept = [line for line in lines if int(line.split(",")[0]) <= step]
+    path.write_text("\n".join([",".join(columns), *kept]) + "\n", encoding="utf-8")
