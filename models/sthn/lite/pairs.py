@@ -70,7 +70,6 @@ class Pairs(IterableDataset):
         relation = frame_to_map_m(spec.noise, FRAME_WIDTH_M, rng)
 
         to_map = ground @ px_to_m(spec.map_px, spec.map_width_m)
-        frame_m_per_px = FRAME_WIDTH_M / spec.frame_px
         to_frame = ground @ relation @ px_to_m(spec.frame_px, FRAME_WIDTH_M)
         levels = scene.levels
         if scene.later and rng.random() < 0.6:
@@ -84,7 +83,7 @@ class Pairs(IterableDataset):
             classes = cv2.warpPerspective(
                 scene.classes, to_frame, (spec.frame_px, spec.frame_px), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
             )
-        gray = thermal.sensor(thermal.render(seen, classes, frame_m_per_px, rng), frame_m_per_px, rng).astype(np.float32)
+        gray = self.gray(scene, seen, classes, to_frame, rng).astype(np.float32)
         mask = self.mask(rng)
         if spec.frame_reduce > 1:
             size = (spec.frame_px // spec.frame_reduce,) * 2
@@ -95,6 +94,14 @@ class Pairs(IterableDataset):
         colour = thermal.colour_jitter(picture, rng) * (thermal.brightest(picture) > 0)[..., None]
         image = np.ascontiguousarray(np.moveaxis(colour, -1, 0), dtype=np.float32)
         return torch.from_numpy(image), torch.from_numpy(frame), torch.from_numpy(relation)
+
+    def gray(
+        self, scene: SceneMap, seen: np.ndarray, classes: np.ndarray | None, to_frame: np.ndarray, rng: np.random.Generator
+    ) -> np.ndarray:
+        """The frame `[n, n]` in 0..1 over what the camera looks at: colours and classes, or through `to_frame` (frame
+        pixel -> level-0 map pixel) anything else that is known of the map."""
+        m_per_px = FRAME_WIDTH_M / self.spec.frame_px
+        return thermal.sensor(thermal.render(seen, classes, m_per_px, rng), m_per_px, rng)
 
     def mask(self, rng: np.random.Generator) -> np.ndarray:
         """What the sensor saw of the square: all of it, or a turned rectangle that leaves corners unseen."""

@@ -20,6 +20,7 @@ import torch
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
+from ..tgm.frames import PairsWithGenerated, load_generated
 from . import coarse, refine
 from .pairs import COARSE, FRAME_WIDTH_M, REFINE, Pairs
 from .scene import SceneMap, load_map, px_to_m
@@ -140,7 +141,12 @@ def train(args: argparse.Namespace) -> None:
         step, spent_s = kept["step"], kept["spent_s"]
     worlds = sorted(p for p in args.worlds.glob("**/*.tif") if not p.stem.endswith("_classes")) if args.worlds else []
     scenes = training_scenes(args.maps, worlds)
-    pairs = Pairs(scenes, task.spec, args.seed, start=step * args.batch)
+    if args.generated:
+        pairs: Pairs = PairsWithGenerated(
+            scenes, task.spec, args.seed, step * args.batch, load_generated(args.generated, scenes), args.generated_share
+        )
+    else:
+        pairs = Pairs(scenes, task.spec, args.seed, start=step * args.batch)
     loader = DataLoader(pairs, args.batch, num_workers=args.workers, prefetch_factor=3 if args.workers else None)
     curve = args.out / "curve.csv"
     # Rows that a stopped run wrote after its last checkpoint are written again.
@@ -198,8 +204,12 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("stage", choices=sorted(TASKS))
     parser.add_argument("--maps", type=Path, required=True, help="folder of the training maps")
     parser.add_argument("--worlds", type=Path, help="folder of procedural worlds (GeoTIFF, `nightfix simulate --world`)")
+    parser.add_argument("--generated", type=Path, help="folder of thermal maps painted by `sthn.tgm generate`, named as the maps")
+    parser.add_argument("--generated-share", type=float, default=0.5, help="of the frames over maps that have one")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--init", type=Path, help="folder of a training whose weights (same stage) or encoders (another) are the start")
+    parser.add_argument(
+        "--init", type=Path, help="folder of a training whose weights (same stage) or encoders (another) are the start"
+    )
     parser.add_argument("--steps", type=int, default=1600)
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--peak", type=float, default=3e-3)
