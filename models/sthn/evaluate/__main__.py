@@ -108,7 +108,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         table = parse_source(options.source)
         noises = [run.parse_noise(text) for text in options.noise]
-        specs = [methods.Spec.parse(text) for text in options.method]
+        specs = methods.parse_all(options.method)
         open_pairs = opener(table, options.seed, options.pairs, any(noise.kinds for noise in noises))
         source = describe(table, open_pairs(FRAME_PX, options.radius_m[0])) | {"seed": options.seed}
         plan = run.Plan(specs, options.radius_m, noises, options.seed, options.pictures)

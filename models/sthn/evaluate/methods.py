@@ -7,8 +7,10 @@ A method is named `[LABEL=]KIND:WHAT[,OPTION=VALUE ...]`:
     "STHN 512=checkpoint:runs/dc{dc}.pth,window=512,levels=2"  a .pth states neither window nor levels
     rival:sift+magsac        rival:dhn@runs/dhn,window=512
 
-`{dc}` in a path becomes the D_C of each condition: the paper trains a network for each. Options: `window`, `levels`,
-`padding`, `stages` (1: the coarse stage alone) of a checkpoint, `stages` of a bundle, `window` of a rival (512 by default).
+`rival:all` is every rival that is not named by itself: all of Tables I and II. `{dc}` in a path becomes the D_C of each
+condition: the paper trains a network for each. Options: `window`, `levels`, `padding`, `stages` (1: the coarse stage alone)
+of a checkpoint, `stages` of a bundle, `window` of a rival (metres, 512 by default). Networks take pixels: at another scale
+than 1 m/px (low flights) the same pixels are another ground.
 """
 
 from __future__ import annotations
@@ -100,9 +102,24 @@ class Spec:
             raise MethodError(f"{self.text}: {error}") from error
 
 
-def needed_px(method: Rival) -> int:
+def parse_all(texts: list[str]) -> list[Spec]:
+    """Every method of the command line, `rival:all` as its rivals."""
+    specs: list[Spec] = []
+    named = {Spec.parse(text).what.partition("@")[0] for text in texts if Spec.parse(text).kind == "rival"}
+    for text in texts:
+        spec = Spec.parse(text)
+        if spec.kind != "rival" or spec.what != "all":
+            specs.append(spec)
+            continue
+        specs += [dataclasses.replace(spec, text=f"rival:{n}", label="", what=n) for n in rivals.names() if n not in named]
+    return specs
+
+
+def needed_px(method: Rival, m_per_px: float = 1.0) -> int:
     """Side of the window that a method wants, px, margin included."""
-    return int(method.window_m or RIVAL_WINDOW_M)
+    if isinstance(method, BundleMethod | CheckpointMethod):
+        return method.window_px
+    return round((method.window_m or RIVAL_WINDOW_M) / m_per_px)
 
 
 class CheckpointMethod:
@@ -112,12 +129,12 @@ class CheckpointMethod:
 
     def __init__(self, network: Sthn, name: str, note: str = "") -> None:
         self.network, self.name, self.note = network.eval(), name, note
-        self.window_m: int | None = network.config.database_size
+        self.window_px, self.window_m = network.config.database_size, None
 
     def match(self, pair: Pair) -> StagedMatch:
         """Eq. (1) to (8), from decoded pixels."""
-        rivals.base.check_window(self, pair)
         config = self.network.config
+        _check_sides(self.name, pair, config.database_size, None)
         clock = _StageClock(self.network)
         began = time.perf_counter()
         with clock, torch.inference_mode():
@@ -144,21 +161,21 @@ class BundleMethod:
         self.name = name or manifest["name"] + (", coarse stage" if coarse_only else "")
         self.search_radius_m = search_radius_m or manifest["search_radius_m"]
         self.margin_px = int(manifest["window_margin_m"])
-        self.window_m: int | None = int(manifest["window_width_m"]) + 2 * self.margin_px
+        self.window_px, self.window_m = int(manifest["window_width_m"]) + 2 * self.margin_px, None
         self.note = ""
         if self.search_radius_m > manifest["search_radius_m"]:
             self.note = f"made for D_C {manifest['search_radius_m']:g} m"
 
     def match(self, pair: Pair) -> StagedMatch:
         """Coarse, crop, refine. The search disc is that of D_C about the window's middle."""
-        rivals.base.check_window(self, pair)
+        _check_sides(self.name, pair, self.window_px, int(self.bundle.manifest["frame_width_m"]))
         manifest, rgb, frame = self.bundle.manifest, pair.satellite, pair.thermal
         detail: dict[str, float | int | str] = {}
         began = time.perf_counter()
         try:
             if manifest["coarse"]["kind"] == "correlation":
                 middle = (manifest["window_width_m"] - 1) / 2
-                found = correlate.run_coarse(self.bundle, rgb, frame, disc=(middle, middle, self.search_radius_m))
+                found = correlate.run_coarse(self.bundle, rgb, frame, disc=(middle, middle, self.search_radius_m / pair.m_per_px))
                 coarse = found.quad
                 detail |= found.evidence
             else:
@@ -182,6 +199,14 @@ class BundleMethod:
             detail["refine_s"] = ended - between
         rim = self.margin_px
         return _answer(pair, quad + rim, None if self.coarse_only else coarse + rim, ended - began, detail)
+
+
+def _check_sides(name: str, pair: Pair, window_px: int, frame_px: int | None) -> None:
+    """Images of other sides are an error, not a bad answer."""
+    if pair.window_m != window_px:
+        raise MethodError(f"{name}: pair {pair.name}: expected a window of {window_px} px, found {pair.window_m}")
+    if frame_px not in (None, pair.thermal.shape[0]):
+        raise MethodError(f"{name}: pair {pair.name}: expected a frame of {frame_px} px, found {pair.thermal.shape[0]}")
 
 
 def _answer(

@@ -95,19 +95,20 @@ def _draw(axis: Axes, tile: Tile) -> None:
     assert tile.record.picture_width_m is not None
     half = tile.record.picture_width_m / 2
     axis.imshow(tile.image("satellite"), extent=(-half, half, half, -half))
-    for quad, colour in ((tile.record.truth, TRUTH), (tile.score.coarse, COARSE), (tile.score.quad, FINAL)):
+    # The thickest first: where all agree each is still seen.
+    for quad, colour, width in ((tile.record.truth, TRUTH, 3.6), (tile.score.coarse, COARSE, 2.2), (tile.score.quad, FINAL, 0.9)):
         if quad is not None:
-            outline(axis, quad, colour)
+            outline(axis, quad, colour, width)
     shown = min(tile.window_m, tile.record.picture_width_m) / 2
     axis.set(xlim=(-shown, shown), ylim=(shown, -shown))
     error = "no answer" if tile.score.corner_m is None else f"{tile.score.corner_m:.1f} m"
     axis.set_title(f"{tile.label}: {error}", fontsize=8)
 
 
-def outline(axis: Axes, quad: Quad, colour: str) -> None:
+def outline(axis: Axes, quad: Quad, colour: str, width: float) -> None:
     """TL, TR, BL, BR as a closed line."""
     ring = np.array([quad[i] for i in (0, 1, 3, 2, 0)])
-    axis.plot(ring[:, 0], ring[:, 1], color=colour, linewidth=1.3)
+    axis.plot(ring[:, 0], ring[:, 1], color=colour, linewidth=width)
 
 
 def save(figure: plt.Figure, out: Path) -> Path:

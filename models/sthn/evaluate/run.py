@@ -71,8 +71,9 @@ def run(plan: Plan, open_pairs: OpenPairs, source: dict[str, Any], out: Path, co
             if spec.text not in opened or spec.by_radius or spec.kind == "bundle":
                 opened[spec.text] = spec.open(radius)
         methods = [opened[spec.text] for spec in plan.specs]
-        _add_methods(results, plan.specs, methods)
-        width = max(needed_px(method) for method in methods)
+        scale = float(source.get("m_per_px", 1.0))
+        _add_methods(results, plan.specs, methods, scale)
+        width = max(needed_px(method, scale) for method in methods)
         plain = open_pairs(width, radius)
         for noise in plan.noises:
             _run_condition(results, plan, methods, with_noise(plain, noise, plan.seed), radius, noise, out)
@@ -80,14 +81,14 @@ def run(plan: Plan, open_pairs: OpenPairs, source: dict[str, Any], out: Path, co
     return results
 
 
-def _add_methods(results: Results, specs: Sequence[Spec], methods: Sequence[Rival]) -> None:
+def _add_methods(results: Results, specs: Sequence[Spec], methods: Sequence[Rival], m_per_px: float) -> None:
     if results.methods:
         return
     for spec, method in zip(specs, methods, strict=True):
         if method.name in {m.label for m in results.methods}:
             raise ValueError(f"{spec.text}: expected a label of its own (LABEL={spec.text}), found {method.name} twice")
-        width = needed_px(method) - 2 * getattr(method, "margin_px", 0)
-        results.methods.append(Method(method.name, spec.text, width))
+        width = needed_px(method, m_per_px) - 2 * getattr(method, "margin_px", 0)
+        results.methods.append(Method(method.name, spec.text, width * m_per_px))
 
 
 def _run_condition(
@@ -115,7 +116,7 @@ def _run_condition(
 
 def match_one(method: Rival, pair: Pair, keep_quads: bool = False) -> PairScore:
     """One method on one pair."""
-    seen = narrowed(pair, needed_px(method))
+    seen = narrowed(pair, needed_px(method, pair.m_per_px))
     match = method.match(seen)
     found = metrics.score(seen, match.homography, str(match.detail.get("failure", "")))
     quad, coarse = _quads(match, seen) if keep_quads else (None, None)
