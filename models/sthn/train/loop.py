@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from .. import geometry
-from ..data.pair import PairSource, TrainingSource
+from ..data.pair import Pair, PairSource, TrainingSource
 from . import box, pictures, saving
 from .experiment import Experiment
 from .stream import Fixed, Steps, Stream, loader
@@ -57,6 +57,7 @@ class Loop:
         self.validation = Fixed(validation, self.side_px)
         first = validation[0]
         self.m_per_network_px = first.m_per_px * first.window_m / self.side_px
+        self.identity = torch.from_numpy(_centred(first, self.side_px)).float()
         optimiser = torch.optim.AdamW(
             task.parameters(), lr=self.table.peak_lr, weight_decay=self.table.weight_decay, eps=self.table.eps
         )
@@ -173,7 +174,7 @@ class Loop:
         )
         for window, thermal, truth in batches:
             found = self.module(window, thermal, truth)
-            values = [torch.zeros_like(truth), found.get("coarse", found["final"]), found["final"]]
+            values = [self.identity.to(truth.device), found.get("coarse", found["final"]), found["final"]]
             sums[:3] += torch.stack([self._mace_m(v, truth).sum() for v in values]).double().cpu()
             sums[3] += len(truth)
         sums = self.fabric.all_reduce(sums, reduce_op="sum").cpu()
@@ -207,6 +208,13 @@ class Loop:
             saving.save_released(network, self.out / name)
         else:
             saving.write_atomically({key: net.state_dict() for key, net in self.task.nets().items()}, self.out / f"{name}.pth")
+
+
+def _centred(pair: Pair, side_px: int) -> np.ndarray:
+    """The displacement of a frame in the window's middle: what knows nothing answers."""
+    frame_px = pair.thermal.shape[0]
+    edges = geometry.edge_corners(frame_px) + (pair.window_m - frame_px) / 2
+    return geometry.displacement_of(side_px, geometry.inclusive_of_edges(edges, pair.window_m / side_px))
 
 
 def make_fabric(precision: str, accelerator: str = "auto", devices: str | int = 1, strategy: str = "auto") -> Fabric:

@@ -1,0 +1,354 @@
+"""Training: losses against the paper's equations, the box's augmentation, the order of pairs, and going on bit for bit."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+import torch
+from conftest import SMALL
+from safetensors.torch import load_file
+
+from sthn.checkpoint import CheckpointError, load_checkpoint
+from sthn.data import DataError, Pair
+from sthn.network import NetworkConfig, Sthn, bounding_box
+from sthn.train import box, experiment, loop, saving
+from sthn.train.__main__ import main
+from sthn.train.experiment import BoxTable
+from sthn.train.stream import Steps, Stream
+from sthn.train.task import SthnTask, sequence_loss
+
+TINY = NetworkConfig(resize_width=32, database_size=64, corr_level=2, iters_lev0=2, iters_lev1=2, fine_padding=4, two_stages=True)
+
+
+def images(count: int, side: int, frame: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    window = torch.randint(0, 256, (count, side, side, 3), generator=generator, dtype=torch.uint8)
+    return window, torch.randint(0, 256, (count, frame, frame), generator=generator, dtype=torch.uint8)
+
+
+def test_the_coarse_loss_is_equation_3() -> None:
+    generator = torch.Generator().manual_seed(1)
+    steps, truth = torch.randn(6, 3, 2, 2, 2, generator=generator), torch.randn(3, 2, 2, 2, generator=generator)
+    wanted = sum(0.85 ** (6 - k - 1) * (steps[k] - truth).abs().mean().item() for k in range(6))
+    assert sequence_loss(steps, truth, 0.85).item() == pytest.approx(wanted, rel=1e-6)
+
+
+def test_the_fine_loss_is_equation_5_with_kappa_in_front() -> None:
+    """kappa L1(D_RB->RT - its truth): mapped to the coarse scale, both sides move by the box alike."""
+    torch.manual_seed(0)
+    task = SthnTask(Sthn(SMALL))
+    window, thermal = images(2, 128, 64)
+    truth = torch.randn(2, 2, 2, 2)
+    drawn = torch.tensor([[3.0, -5.0, 8.0], [-4.0, 6.0, 12.0]])
+    out = task(window, thermal, truth, drawn)
+    with torch.no_grad():
+        match = task.network(
+            window.permute(0, 3, 1, 2) / 255,
+            thermal[:, None].expand(-1, 3, -1, -1) / 255,
+            lambda d: box.augmented(d, SMALL, drawn),
+        )
+    eta = match.box.width / SMALL.resize_width
+    kappa = (eta / SMALL.alpha)[:, None, None, None]
+    inside = (truth - match.box.flow(128) / SMALL.alpha) / kappa  # the truth in pixels of the crop
+    wanted = 0.0
+    for k, step in enumerate(match.fine_iterations):
+        wanted += 0.85 ** (len(match.fine_iterations) - k - 1) * (kappa * (step - inside).abs()).mean().item()
+    assert out["loss_fine"].item() == pytest.approx(wanted, rel=1e-4)
+    assert out["loss"].item() == pytest.approx(out["loss_coarse"].item() + out["loss_fine"].item(), rel=1e-6)  # (6)
+
+
+def test_coarse_and_fine_learn_from_their_own_loss() -> None:
+    torch.manual_seed(0)
+    task = SthnTask(Sthn(SMALL))
+    out = task(*images(2, 128, 64), torch.randn(2, 2, 2, 2), torch.zeros(2, 3))
+    out["loss_fine"].backward(retain_graph=True)
+    assert all(p.grad is None for p in task.nets()["netG"].parameters()), "detached between the stages"
+    out["loss_coarse"].backward()
+    for name, net in task.nets().items():
+        grads = [p.grad for p in net.parameters()]
+        assert all(g is not None and torch.isfinite(g).all() for g in grads) and sum(float(g.norm()) for g in grads) > 0, name
+
+
+def test_half_precision_is_for_convolutions_only() -> None:
+    torch.manual_seed(0)
+    task = SthnTask(Sthn(SMALL)).eval()
+    batch = (*images(2, 128, 64), torch.zeros(2, 2, 2, 2))
+    with torch.no_grad():
+        whole = task(*batch)["coarse"]
+        with torch.autocast("cpu", torch.bfloat16):
+            half = task(*batch)["coarse"]
+            features = task.network.netG.encode(torch.rand(1, 3, 64, 64))
+    assert features.dtype == torch.bfloat16 and half.dtype == torch.float32
+    assert 0 < (half - whole).abs().max() < 0.1 * whole.abs().max() + 0.05
+    # A displacement kept in bfloat16 would have 8 bits: its last ones are there.
+    assert (half.bfloat16().float() != half).any()
+
+
+@pytest.mark.parametrize(
+    ("table", "moves", "widens"),
+    [
+        (BoxTable(), 64, 64),
+        (BoxTable(rule="paper"), 64, 128),
+        (BoxTable(kind="widen"), 0, 64),
+        (BoxTable(kind="none"), 0, 0),
+        (BoxTable(centre_px=16, widen_px=8), 16, 8),
+    ],
+)
+def test_bounds_of_the_box_augmentation(table: BoxTable, moves: float, widens: float) -> None:
+    drawn = box.draw(table, 4000, torch.Generator().manual_seed(0))
+    assert drawn[:, :2].abs().max() <= moves and 0 <= drawn[:, 2].min() and drawn[:, 2].max() <= widens
+    if moves:
+        assert drawn[:, :2].min() < -0.98 * moves and drawn[:, :2].max() > 0.98 * moves
+        assert abs(float(torch.corrcoef(drawn[:, :2].T)[0, 1])) < 0.05, "each axis its own"
+    if widens:
+        assert drawn[:, 2].max() > 0.98 * widens and drawn[:, 2].mean() == pytest.approx(widens / 2, rel=0.05)
+
+
+def test_training_pads_the_box_by_its_augmentation_alone_and_evaluation_by_twice_32() -> None:
+    config = dataclasses.replace(SMALL, fine_padding=32)
+    still = torch.zeros(1, 2, 2, 2)
+    tight = box.augmented(still, config, torch.zeros(1, 3))
+    moved = box.augmented(still, config, torch.tensor([[10.0, -20.0, 6.0]]))
+    evaluated = bounding_box(still, config)
+    assert (tight.left.item(), tight.width.item()) == (0.0, 128.0)
+    assert (moved.left.item(), moved.top.item(), moved.width.item()) == (10 - 3, -20 - 3, 134)
+    assert evaluated.width.item() == 128 + 2 * 32
+
+
+class Numbered:
+    """A source whose pairs say which they are and of which draw."""
+
+    window_m, search_radius_m = 64, 5.0
+
+    def __init__(self, name: str, count: int, seed=0) -> None:
+        self.name, self.count, self.seed = name, count, seed
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> Pair:
+        pixels = np.zeros((64, 64, 3), np.uint8)
+        return Pair(f"{self.name} {index} {self.seed}", pixels, pixels[..., 0], np.eye(3))
+
+    def reseeded(self, seed) -> Numbered:
+        return Numbered(self.name, self.count, seed)
+
+
+def test_passes_alternate_and_the_generated_set_is_capped() -> None:
+    stream = Stream(Numbered("real", 6), Numbered("made", 50), 3, 32)
+    names = [stream.pair(n).name.split(" ", 2) for n in range(24)]
+    assert [source for source, *_ in names] == (["real"] * 6 + ["made"] * 6) * 2
+    first, second = names[:6], names[12:18]
+    assert {i for _, i, _ in first} == {i for _, i, _ in second} == {str(i) for i in range(6)}
+    assert [i for _, i, _ in first] != [i for _, i, _ in second], "another order"
+    assert {s for *_, s in first} == {"(3, 0)"} and {s for *_, s in second} == {"(3, 2)"}, "other draws"
+    made, again = ({i for _, i, _ in names[a : a + 6]} for a in (6, 18))
+    assert len(made) == 6 and made != again, "another N_T of the generated ones"
+    assert [Stream(Numbered("real", 6), Numbered("made", 50), 3, 32).pair(n).name for n in (20, 3)] == [
+        stream.pair(20).name,
+        stream.pair(3).name,
+    ]
+
+
+def test_processes_share_out_a_batch() -> None:
+    alone = list(Steps(2, 5, 4))
+    shares = [list(Steps(2, 5, 4, rank, 2)) for rank in range(2)]
+    assert alone == [[8, 9, 10, 11], [12, 13, 14, 15], [16, 17, 18, 19]]
+    assert [a + b for a, b in zip(*shares, strict=True)] == alone
+    with pytest.raises(ValueError, match="training.batch: expected a multiple of 3"):
+        Steps(0, 1, 4, 0, 3)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a map and a tiny two-stage experiment over it: 64 px windows, 32 px frames."""
+    out = tmp_path_factory.mktemp("train")
+    rng = np.random.default_rng(0)
+    rgb = sum(cv2.resize(rng.random((n, n, 3)).astype(np.float32), (300, 300)) for n in (6, 25, 80)) * 84 + 2
+    profile = {"driver": "GTiff", "width": 300, "height": 300, "count": 3, "dtype": "uint8", "crs": "EPSG:32612"}
+    with rasterio.open(out / "m.tif", "w", transform=rasterio.transform.Affine(8, 0, 3e5, 0, -8, 3.9e6), **profile) as file:
+        file.write(np.moveaxis(rgb.astype(np.uint8), -1, 0))
+    source = 'kind = "maps"\nmaps = ["m.tif"]\nm_per_px = 8.0\nframe_px = 32\n'
+    (out / "base.toml").write_text(
+        'row = "none: a test"\nwindow_m = 64\nsearch_radius_m = 60\n[network]\nlevels = 2\nresize_width = 32\niterations = 2\n'
+        "fine_iterations = 2\nfine_padding = 4\ntwo_stages = true\n[box]\ncentre_px = 6\nwiden_px = 6\n"
+        "[training]\nsteps = 4\nbatch = 2\nworkers = 0\nlog_every = 1\nvalidate_every = 2\nsave_every = 2\npicture_every = 4\n"
+        f'[noise]\nrotation_deg = 10\n[data]\nroot = "{out}"\n'
+        f"[data.train]\naugment = true\ncount = 3\n{source}[data.extended]\ncount = 9\nseed = 5\n{source}"
+        f"[data.validation]\ncount = 3\nseed = 9\n{source}"
+    )
+    (out / "e.toml").write_text('base = "base.toml"\nseed = 4\n[training]\npeak_lr = 1e-3\n')
+    return out
+
+
+@pytest.fixture(scope="module")
+def whole(place: Path) -> Path:
+    """Four steps without a stop."""
+    out = place / "whole"
+    assert main([str(place / "e.toml"), "--out", str(out), "--accelerator", "cpu"]) == 0
+    return out
+
+
+def test_a_training_that_stops_and_goes_on_equals_one_that_does_not(place: Path, whole: Path, monkeypatch) -> None:
+    stopped = place / "stopped"
+    write = saving.write_atomically
+
+    def interrupt(state: dict, path: Path) -> None:
+        write(state, path)
+        raise KeyboardInterrupt
+
+    words = [str(place / "e.toml"), "--out", str(stopped), "--accelerator", "cpu"]
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(saving, "write_atomically", interrupt)
+        main(words)
+    assert [p.name for p in (stopped / "checkpoints").iterdir()] == ["step-00000002.pt"]
+    (stopped / "curve.csv").open("a").write("3,0,0,0,0,0,0,0\n")  # a row after the checkpoint
+    assert main(words) == 2, "a folder in use is not overwritten"
+    assert main([*words, "--resume"]) == 0
+    one, other = (saving.load(out / "checkpoints/step-00000004.pt") for out in (whole, stopped))
+    assert one["task"].keys() == other["task"].keys()
+    for key, value in one["task"].items():
+        assert torch.equal(value, other["task"][key]), key
+    for index, state in one["optimiser"]["state"].items():
+        assert all(torch.equal(state[k], other["optimiser"]["state"][index][k]) for k in ("step", "exp_avg", "exp_avg_sq"))
+    rows = [[row[:1] + row[2:] for row in csv.reader((out / "curve.csv").open())] for out in (whole, stopped)]
+    assert rows[0] == rows[1] and len(rows[0]) == 5, "the curve too, but for its seconds"
+
+
+def test_a_training_may_go_on_from_any_checkpoint(place: Path, whole: Path) -> None:
+    words = [str(place / "e.toml"), "--out", str(place / "other"), "--accelerator", "cpu"]
+    assert main([*words, "--resume", str(whole / "checkpoints/step-00000002.pt")]) == 0
+    one, other = (load_file(out / "final/model.safetensors") for out in (whole, place / "other"))
+    assert all(torch.equal(value, other[key]) for key, value in one.items())
+
+
+def test_checkpoints_are_in_the_released_layouts_and_load_strictly(whole: Path) -> None:
+    trained = load_checkpoint(whole / "final")
+    assert trained.config == TINY
+    other = load_checkpoint(whole / "STHN.pth", TINY)
+    assert all(torch.equal(value, other.state_dict()[key]) for key, value in trained.state_dict().items())
+    assert load_checkpoint(whole / "best").config == TINY
+    with pytest.raises(CheckpointError, match="expected shape"):
+        load_checkpoint(whole / "final", dataclasses.replace(TINY, corr_level=1))
+    assert (whole / "pictures/step-00000004.jpg").stat().st_size > 1000
+
+
+def test_two_stages_start_from_a_coarse_checkpoint(place: Path, whole: Path) -> None:
+    torch.manual_seed(8)
+    coarse = Sthn(dataclasses.replace(TINY, two_stages=False))
+    saving.save_released(coarse, place / "coarse")
+    both = Sthn(TINY)
+    fresh = {key: value.clone() for key, value in both.state_dict().items()}
+    saving.start_from(both, place / "coarse")
+    for key, value in both.state_dict().items():
+        assert torch.equal(value, fresh[key] if key.startswith("netG_fine.") else coarse.state_dict()[key])
+    saving.start_from(both, whole / "STHN.pth")
+    assert torch.equal(both.netG_fine.fnet1.conv1.weight, load_checkpoint(whole / "final").netG_fine.fnet1.conv1.weight)
+    with pytest.raises(CheckpointError, match="unexpected netG_fine"):
+        saving.start_from(coarse, whole / "STHN.pth")
+
+
+def test_validation_has_no_augmentation_and_metres_are_metres(place: Path, whole: Path) -> None:
+    """The identity's MACE over the validation pairs, computed here from their truth, is the file's: nothing moved them,
+    and a network pixel is alpha window pixels of 8 m."""
+    from sthn.data import open_source
+
+    made = experiment.read(place / "e.toml")
+    table = made.source_table("validation")
+    assert "noise" not in table and made.source_table("train")["noise"]["rotation_deg"] == 10
+    source = open_source(table, root=place)
+    wanted = np.mean([8 * np.hypot(*(source[i].centre() - 31.5)) for i in range(3)])  # a shift: every corner's is the centre's
+    rows = list(csv.DictReader((whole / "validation.csv").open()))
+    assert [row["step"] for row in rows] == ["2", "4"]
+    assert [float(row["identity_m"]) for row in rows] == pytest.approx([wanted] * 2, rel=1e-4)
+    text = (place / "e.toml").read_text() + "[data.validation]\naugment = true\n"
+    (place / "bad.toml").write_text(text)
+    with pytest.raises(DataError, match="data.validation: augment: expected false"):
+        experiment.read(place / "bad.toml")
+
+
+def test_the_box_is_not_augmented_in_validation(place: Path, monkeypatch) -> None:
+    monkeypatch.setattr(box, "augmented", lambda *_: pytest.fail("augmented outside training"))
+    torch.manual_seed(0)
+    made = experiment.read(place / "e.toml", ["training.steps=1"])
+    fabric = loop.make_fabric("32-true", "cpu")
+    source = Numbered("real", 2)
+    run = loop.Loop(SthnTask(Sthn(TINY)), made, source, source, None, place / "validate", fabric)
+    run.out.mkdir()
+    run._validate(0.0)
+    assert np.isfinite(run.best_m)
+
+
+def test_the_schedule_and_the_optimiser_are_the_published_ones(place: Path, whole: Path) -> None:
+    state = saving.load(whole / "checkpoints/step-00000004.pt")["optimiser"]["param_groups"]
+    assert len(state) == 1
+    group = state[0]
+    assert (group["weight_decay"], group["eps"], tuple(group["betas"])) == (1e-5, 1e-8, (0.9, 0.999))
+    rates = [float(row["lr"]) for row in csv.DictReader((whole / "curve.csv").open())]
+    # Linear from peak / 25 over 5 % of steps + 100, the end of the rise included.
+    rise = 0.05 * (4 + 100) - 1
+    wanted = [1e-3 / 25 + (1e-3 - 1e-3 / 25) * step / rise for step in range(4)]
+    assert rates == pytest.approx(wanted, rel=1e-3)
+
+
+def test_each_net_is_clipped_apart(place: Path, monkeypatch) -> None:
+    made = experiment.read(place / "e.toml", ["training.clip=0.001"])
+    source = Numbered("real", 4)
+    run = loop.Loop(SthnTask(Sthn(TINY)), made, source, source, None, place / "clip", loop.make_fabric("32-true", "cpu"))
+    monkeypatch.setattr(run.optimiser.optimizer, "step", lambda *_, **__: None)
+    window, thermal = images(2, 64, 32)
+    run._train_step(window, thermal, torch.full((2, 2, 2, 2), 3.0))
+    for net in run.task.nets().values():
+        norm = torch.stack([p.grad.norm() for p in net.parameters()]).norm().item()
+        assert norm == pytest.approx(0.001, rel=1e-2)
+
+
+def test_it_learns_a_batch_by_heart() -> None:
+    """Both stages, without augmentation: far below identity within seconds."""
+    torch.manual_seed(3)
+    task = SthnTask(Sthn(TINY))
+    window, thermal = images(2, 64, 32, seed=5)
+    truth = torch.tensor([[3.0, -2.0], [-4.0, 1.0]])[:, :, None, None].expand(2, 2, 2, 2)
+    optimiser = torch.optim.AdamW(task.parameters(), lr=1e-3)
+    for _ in range(40):
+        out = task(window, thermal, truth, torch.zeros(2, 3))
+        optimiser.zero_grad()
+        out["loss"].backward()
+        optimiser.step()
+    errors = {key: (out[key].detach() - truth).norm(dim=1).mean().item() for key in ("coarse", "final")}
+    identity = truth.norm(dim=1).mean().item()
+    assert errors["coarse"] < 0.35 * identity and errors["final"] < 0.35 * identity, (identity, errors)
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("training.step=1", "training: step: expected one of .*, found an unknown key"),
+        ("network.levels=9", "corr_level: expected 1 to 3, found 9"),
+        ('box.kind="wide"', r"box.kind: expected none \| widen \| full, found wide"),
+        ('training.precision="16-mixed"', r"training.precision: expected 32-true \| bf16-mixed"),
+        ("training.batch=0", "training.batch: expected 1 to 4096, found 0"),
+        ("seed=one", "expected KEY=VALUE with a TOML value"),
+        ("data.train.kind=3", "kind: expected boson"),
+    ],
+)
+def test_a_wrong_key_is_an_error_that_names_it(place: Path, override: str, said: str, capsys) -> None:
+    import re
+
+    words = [str(place / "e.toml"), "--out", str(place / "never"), "--accelerator", "cpu", "--set", override]
+    assert main(words) == 2
+    text = capsys.readouterr().err
+    assert re.search(said, text), text
+
+
+def test_a_base_that_names_itself_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text('base = "b.toml"\n')
+    (tmp_path / "b.toml").write_text('base = "a.toml"\n')
+    with pytest.raises(DataError, match="base: expected at most 8 files, none twice"):
+        experiment.read(tmp_path / "a.toml")
