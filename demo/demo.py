@@ -59,7 +59,7 @@ def make_flight(binary: Path, folder: Path, seed: int, frames: int) -> Flight:
     """World, map and recorded flight, all from the seed."""
     run_binary(
         binary, "simulate", "--world", seed, "--seed", seed, "--out", folder, "--frames", frames, "--trajectory", "lawnmower",
-        "--radius-m", D_C_M, "--yaw-noise-deg", 5, "--scale-noise", 0.05,
+        "--radius-m", D_C_M, "--yaw-noise-deg", 5, "--scale-noise", 0.05, "--attitude-noise-deg", 1, "--report-attitude",
     )  # fmt: skip
     return read_flight(folder)
 

@@ -180,12 +180,27 @@ mod tests {
 
     const SIDE: usize = 512;
 
-    /// Blocks of 40 m in random greys, or white noise.
+    /// Waves of 40 to 90 m in every direction, or white noise.
     fn picture(noise: bool) -> Vec<u8> {
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(3);
-        let blocks: Vec<u8> = (0..32 * 32).map(|_| rng.random_range(20..230)).collect();
+        let waves: Vec<[f64; 3]> = (0..12)
+            .map(|_| {
+                let (length, way) = (rng.random_range(40.0..90.0), rng.random_range(0.0..std::f64::consts::TAU));
+                let k = std::f64::consts::TAU / length;
+                [k * f64::cos(way), k * f64::sin(way), rng.random_range(0.0..7.0)]
+            })
+            .collect();
+        let sum = |x: f64, y: f64| waves.iter().map(|[a, b, c]| (a * x + b * y + c).sin()).sum::<f64>();
         (0..SIDE * SIDE)
-            .map(|i| if noise { rng.random_range(0..255) } else { blocks[i / SIDE / 40 * 32 + i % SIDE / 40] })
+            .map(
+                |i| {
+                    if noise {
+                        rng.random_range(0..255)
+                    } else {
+                        (128.0 + 30.0 * sum((i % SIDE) as f64, (i / SIDE) as f64)) as u8
+                    }
+                },
+            )
             .collect()
     }
 
@@ -201,12 +216,12 @@ mod tests {
     const STAY: Homography = Homography([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
 
     #[test]
-    fn noise_has_no_coarse_structure_and_blocks_have() {
+    fn noise_has_no_coarse_structure_and_waves_have() {
         let seen = vec![1; SIDE * SIDE];
         let texture = |noise: bool| frame_texture(&FrameView { size_px: SIDE, gray: &picture(noise), seen: &seen });
-        let (noise, blocks) = (texture(true), texture(false));
+        let (noise, waves) = (texture(true), texture(false));
         assert!(noise.smoothness < 0.35 && noise.coarse < 8.0, "{noise:?}");
-        assert!(blocks.smoothness > 0.7 && blocks.coarse > 30.0, "{blocks:?}");
+        assert!(waves.smoothness > 0.7 && waves.coarse > 30.0, "{waves:?}");
         let nothing = frame_texture(&FrameView { size_px: SIDE, gray: &picture(true), seen: &vec![0; SIDE * SIDE] });
         assert_eq!(nothing, Texture { coarse: 0.0, smoothness: 0.0 });
     }

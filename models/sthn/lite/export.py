@@ -1,6 +1,9 @@
 """Trained light stages -> a model bundle, through the one door (`sthn.bundle`).
 
-python -m sthn.lite.export --coarse DIR --refine DIR --out models/bundles/lite-1536
+    python -m sthn.lite.export --coarse DIR --refine DIR --out models/bundles/lite-1536
+    python -m sthn.lite.export --coarse DIR --refine DIR --window-m 512 --radius-m 64 --out models/bundles/lite-512
+
+One training serves every rung of the ladder: the map's features belong to the map, so that a window is a slice of them.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ from . import coarse, refine
 from .pairs import FRAME_WIDTH_M, REFINE
 
 OPSET = 17
-WINDOW_M, MARGIN_M, SEARCH_RADIUS_M = 1536.0, 128.0, 512.0
+MARGIN_M = 128.0
 COARSE_M_PER_PX = 16 / 3
 STRIDE = 2
 # Steps of the training's own noise (5.5 degrees, 7.5 %), so that a truth in between is seen by its neighbours.
@@ -51,8 +54,9 @@ def to_onnx(module: torch.nn.Module, inputs: dict[str, torch.Tensor], outputs: l
     return buffer.getvalue()
 
 
-def golden_pair(side: int, frame_px: int, seed: int = 7) -> tuple[np.ndarray, np.ndarray]:
-    """A map of coloured fields and roads, and the frame cut from it with other values; flat, so that it packs small."""
+def golden_pair(side: int, frame_px: int, seed: int = 7, radius_m: float = 512.0) -> tuple[np.ndarray, np.ndarray]:
+    """A map of coloured fields and roads, and the frame cut from it with other values; flat, so that it packs small. The
+    frame lies 0.38 D_C from the middle."""
     rng = np.random.default_rng(seed)
     picture = np.full((side, side, 3), (110, 120, 90), np.uint8)
     heat = np.full((side, side), 90, np.uint8)
@@ -67,8 +71,9 @@ def golden_pair(side: int, frame_px: int, seed: int = 7) -> tuple[np.ndarray, np
         width = int(rng.integers(5, 14))
         cv2.polylines(picture, [line], False, (180, 180, 175), width)
         cv2.polylines(heat, [line], False, 220, width)
-    turn = cv2.getRotationMatrix2D((side / 2 + 170.0, side / 2 - 90.0), 4.0, 1.0)
-    turn[:, 2] += np.array([frame_px / 2 - side / 2 - 170.0, frame_px / 2 - side / 2 + 90.0])
+    shift = np.array([170.0, -90.0]) * radius_m / 512.0
+    turn = cv2.getRotationMatrix2D(tuple(side / 2 + shift), 4.0, 1.0)
+    turn[:, 2] += frame_px / 2 - side / 2 - shift
     frame = cv2.warpAffine(heat, turn, (frame_px, frame_px), flags=cv2.INTER_NEAREST)
     return picture, frame
 
@@ -89,7 +94,7 @@ class Exported:
     outputs: dict[str, dict[str, np.ndarray]]
 
 
-def coarse_stage(folder: Path, picture: np.ndarray, frame: np.ndarray) -> Exported:
+def coarse_stage(folder: Path, picture: np.ndarray, frame: np.ndarray, window_m: float) -> Exported:
     """The correlation stage."""
     net = load(folder, coarse.CoarseNet((16, 32, 64, 96)))
     # The map encoder takes any multiple of 16 px: its golden input need not be the whole window.
@@ -105,7 +110,7 @@ def coarse_stage(folder: Path, picture: np.ndarray, frame: np.ndarray) -> Export
         ),
         "coarse": to_onnx(coarse.FrameSide(net), {"frame": example}, ["frame_features"], batch),
     }
-    width_m = WINDOW_M + 2 * MARGIN_M
+    width_m = window_m + 2 * MARGIN_M
     table = {
         "kind": "correlation",
         "map": input_spec(round(width_m / COARSE_M_PER_PX), width_m, "rgb", "half_pixel_antialias"),
@@ -171,11 +176,23 @@ def input_spec(size_px: int, width_m: float, content: str, resize: str) -> dict:
     return {"size_px": size_px, "width_m": width_m, "content": content, "resize": resize}
 
 
-def export(coarse_dir: Path, refine_dir: Path | None, out: Path, name: str, accuracy: dict | None) -> dict[str, float]:
+@dataclass(frozen=True)
+class Rung:
+    """What differs between the bundles of a ladder."""
+
+    window_m: float = 1536.0
+    """W_S."""
+    radius_m: float = 512.0
+    """D_C."""
+    accuracy: dict | None = None
+    scale_range: tuple[float, float] | None = None
+
+
+def export(coarse_dir: Path, refine_dir: Path | None, out: Path, name: str, rung: Rung) -> dict[str, float]:
     """Writes the bundle, checked against torch; returns the largest difference of every golden output."""
     torch.manual_seed(0)
-    picture, frame = golden_pair(int(WINDOW_M + 2 * MARGIN_M), int(FRAME_WIDTH_M))
-    stages = {"coarse": coarse_stage(coarse_dir, picture, frame)}
+    picture, frame = golden_pair(int(rung.window_m + 2 * MARGIN_M), int(FRAME_WIDTH_M), radius_m=rung.radius_m)
+    stages = {"coarse": coarse_stage(coarse_dir, picture, frame, rung.window_m)}
     if refine_dir:
         stages["refine"] = refine_stage(refine_dir, picture, frame)
     graphs = {key: onnx for stage in stages.values() for key, onnx in stage.graphs.items()}
@@ -194,17 +211,19 @@ def export(coarse_dir: Path, refine_dir: Path | None, out: Path, name: str, accu
                 "procedural worlds of this project",
             ],
         },
-        "window_width_m": WINDOW_M,
+        "window_width_m": rung.window_m,
         "window_margin_m": MARGIN_M,
         "frame_width_m": FRAME_WIDTH_M,
         "m_per_px": 1.0,
-        "search_radius_m": SEARCH_RADIUS_M,
+        "search_radius_m": rung.radius_m,
         "tone_mapping": 1,
         "opset": OPSET,
         **{key: stage.table for key, stage in stages.items()},
     }
-    if accuracy:
-        manifest["accuracy"] = accuracy
+    if rung.accuracy:
+        manifest["accuracy"] = rung.accuracy
+    if rung.scale_range:
+        manifest["scale_range"] = list(rung.scale_range)
     draft = in_memory(manifest, graphs)
     found = correlate.run_coarse(draft, picture, frame)
     quad, evidence = found.quad, dict(found.evidence)
@@ -247,10 +266,14 @@ def main() -> None:
     parser.add_argument("--refine", type=Path, help="folder of a refine training; none makes a one-stage bundle")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--name")
+    parser.add_argument("--window-m", type=float, default=1536.0, help="W_S")
+    parser.add_argument("--radius-m", type=float, default=512.0, help="D_C")
+    parser.add_argument("--scale-range", type=float, nargs=2, help="as measured by `sthn.evaluate.scales`")
     parser.add_argument("--accuracy", type=Path, help="JSON of the [accuracy] table, from `sthn.lite.bar`")
     args = parser.parse_args()
     accuracy = json.loads(args.accuracy.read_text()) if args.accuracy else None
-    differences = export(args.coarse, args.refine, args.out, args.name or args.out.name, accuracy)
+    rung = Rung(args.window_m, args.radius_m, accuracy, tuple(args.scale_range) if args.scale_range else None)
+    differences = export(args.coarse, args.refine, args.out, args.name or args.out.name, rung)
     for key, value in differences.items():
         print(f"{key}: largest difference {value:.2e}")
 
