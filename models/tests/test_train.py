@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import rasterio
 import torch
-from conftest import SMALL
+from conftest import ROOT, SMALL
 from safetensors.torch import load_file
 
 from sthn.checkpoint import CheckpointError, load_checkpoint
@@ -352,3 +352,32 @@ def test_a_base_that_names_itself_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "b.toml").write_text('base = "a.toml"\n')
     with pytest.raises(DataError, match="base: expected at most 8 files, none twice"):
         experiment.read(tmp_path / "a.toml")
+
+
+NOISES = {"rotation": ("5", "10", "30"), "scale": ("0p1", "0p2", "0p3"), "perspective": ("8", "16", "32")}
+NOISE_KEYS = {"rotation": "rotation_deg", "scale": "scale", "perspective": "perspective_px"}
+EXPERIMENTS = sorted(path for path in (ROOT / "models/experiments").glob("*/*.toml"))
+
+
+def test_every_experiment_of_the_paper_has_a_file_that_says_what_its_name_says() -> None:
+    made = {f"{path.parent.name}/{path.stem}": experiment.read(path) for path in EXPERIMENTS}
+    assert len({one.row for one in made.values()}) == len(made)
+    for window, levels in ((512, 2), (1024, 4), (1536, 4)):
+        for radius in (50, 64, 128, 256, 512):
+            one = made[f"table-1/ws{window}-dc{radius}"]
+            assert (one.window_m, one.search_radius_m, one.network.levels) == (window, radius, levels)
+            assert not one.network.two_stages and one.config.iters_lev0 == 6 and "extended" in one.data
+            if window == 1536:
+                two = made[f"table-1/ws{window}-dc{radius}-two-stages"]
+                assert two.network.two_stages and two.training.init.endswith(f"dc{radius}/best") and two.box.kind == "full"
+                assert (two.search_radius_m, two.config.fine_padding, two.config.iters_lev1) == (radius, 32, 6)
+    rows = {f"{kind}-{bound}" for kind, bounds in NOISES.items() for bound in bounds}
+    for row in rows:
+        kind, bound = row.split("-")
+        for stages in ("one-stage", "two-stages"):
+            one = made[f"table-3/{row}-{stages}"]
+            assert one.data["validation"]["noise"] == {NOISE_KEYS[kind]: float(bound.replace("p", ".")), "kind": kind}
+            assert (one.noise.rotation_deg, one.noise.scale, one.noise.perspective_px) == (30, 0.3, 16)
+    assert {made[f"ablations/box-{kind}"].box.kind for kind in ("none", "widen", "full")} == {"none", "widen", "full"}
+    assert made["ablations/box-paper"].box.rule == "paper"
+    assert all("extended" not in made[f"ablations/without-tgm-ws512-dc{radius}"].data for radius in (50, 64, 128, 256, 512))

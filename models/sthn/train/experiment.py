@@ -86,7 +86,8 @@ class Experiment:
     noise: Noise
     """Of the training pairs. Validation has none unless its own table says so."""
     data: dict[str, Any]
-    """`root`, and tables `train`, `validation` and, for the generated set, `extended` (`sthn.data.spec`)."""
+    """`root`, and tables `train`, `validation` and, for the generated set, `extended` (`sthn.data.spec`); `extended = false`
+    takes a base's away."""
     seed: int = 0
 
     @property
@@ -144,12 +145,16 @@ def parse(document: dict[str, Any], where: str) -> Experiment:
         if key not in document:
             raise DataError(where, key, "a value", "nothing")
     tables = {name: _table(kind, document.get(name, {}), f"{where}: {name}") for name, kind in TABLES.items()}
+    if document["data"].get("extended") is False:
+        document["data"].pop("extended")
     check(document["data"], {"root": str, "train": dict, "validation": dict, "extended": dict}, f"{where}: data")
     for name in ("train", "validation"):
         if name not in document["data"]:
             raise DataError(f"{where}: data", name, "a table", "nothing")
     if document["data"]["validation"].get("augment"):
         raise DataError(f"{where}: data.validation", "augment", "false: augmentation is for training only", "true")
+    if not document["row"]:
+        raise DataError(where, "row", "which row of which table", "nothing")
     values = {key: document[key] for key in plain if key in document}
     made = Experiment(**values, **tables, data=document["data"])
     _plausible(made, where)
