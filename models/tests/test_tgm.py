@@ -3,19 +3,20 @@
 import json
 from pathlib import Path
 
+import cv2
 import h5py
 import numpy as np
 import pytest
 import rasterio
 import torch
 
-from sthn.data.pair import Pair
+from sthn.data import Pair, open_source
 from sthn.lite.scene import SceneMap, pyramid
 from sthn.tgm import __main__ as command
 from sthn.tgm import checkpoint, generate
 from sthn.tgm.checkpoint import TgmError
 from sthn.tgm.networks import Discriminator, Generator
-from sthn.tgm.pairs import AlignedPairs, aligned, capped, to_pixels, to_unit, usable_indices
+from sthn.tgm.pairs import AlignedPairs, aligned, to_pixels, to_unit, usable_indices
 from sthn.tgm.rendered import Night, RenderedPairs
 from sthn.tgm.train import Recipe, batches, rate_of, train
 
@@ -96,13 +97,6 @@ def test_black_frames_are_removed() -> None:
             return Pair(str(index), np.ones((20, 20, 3), np.uint8), thermal, np.eye(3))
 
     assert usable_indices(Source()) == [0]
-
-
-def test_extended_set_is_capped_and_drawn_anew() -> None:
-    first, second = capped(100, 30, 0, 7), capped(100, 30, 1, 7)
-    assert len(set(first)) == 30 and set(first) != set(second)
-    np.testing.assert_array_equal(first, capped(100, 30, 0, 7))
-    assert sorted(capped(20, 30, 0, 7)) == list(range(20))
 
 
 def test_a_rendered_pair_is_its_number(scene: SceneMap) -> None:
@@ -188,16 +182,17 @@ def test_extended_set_in_the_published_layout(scene: SceneMap, tmp_path: Path) -
     net, rgb = Generator(5, 4).eval(), scene.levels[0][:300, :400].copy()
     rgb[:, 330:] = 0
     excluded = [generate.Region(0, 0, 120, 120)]
-    count = generate.write_extended(net, rgb, tmp_path / "extended.h5", 128, 32, excluded=excluded)
+    places = generate.write_extended(net, rgb, tmp_path / "extended.h5", 128, 32, excluded=excluded)
     with h5py.File(tmp_path / "extended.h5") as file:
         images, names = file["image_data"], [name.decode() for name in file["image_name"][:]]
-        assert images.shape == (count, 32, 32, 3) and images.dtype == np.uint8 and images.chunks == (1, 32, 32, 3)
-        assert file["image_size"][0].tolist() == [32, 32]
-        places = [tuple(map(int, name.split("@")[1:])) for name in names]
+        assert images.shape == (len(places), 128, 128, 3) and images.dtype == np.uint8 and images.chunks == (1, 128, 128, 3)
+        assert file["image_size"][0].tolist() == [128, 128]
+        assert places == [tuple(map(int, name.split("@")[1:])) for name in names]
         tile = rgb[places[3][0] - 64 : places[3][0] + 64, places[3][1] - 64 : places[3][1] + 64]
-        np.testing.assert_array_equal(images[3, ..., 0], generate.paint(net, tile[None], 32)[0])
+        painted = cv2.resize(generate.paint(net, tile[None], 32)[0], (128, 128), interpolation=cv2.INTER_LINEAR)
+        np.testing.assert_array_equal(images[3, ..., 0], painted)
     assert {r % 35 for r, _ in places} == {64 % 35} and all(c + 64 <= 332 for _, c in places)
-    assert not any(r <= 120 and c <= 120 for r, c in places) and len(places) == len(set(places)) == count
+    assert not any(r <= 120 and c <= 120 for r, c in places) and len(places) == len(set(places))
     with pytest.raises(TgmError, match="no tile of 128 px"):
         generate.write_extended(net, np.zeros_like(rgb), tmp_path / "none.h5", 128, 32)
 
@@ -230,10 +225,20 @@ def test_the_commands_go_together(scene: SceneMap, tmp_path: Path, capsys: pytes
     out = tmp_path / "out"
     assert command.main(["train", "--data", str(data), *words, "--out", str(out)]) == 0
     assert set(json.loads(capsys.readouterr().out)) == {"tgm", "training_mean", "own_mean"}
-    generated = ["generate", "--checkpoint", str(out / "last_model.pth"), "--map", str(path)]
-    assert command.main([*generated, "--h5", str(tmp_path / "extended.h5"), "--stride-px", "300"]) == 0
-    with h5py.File(tmp_path / "extended.h5") as file:
-        assert file["image_data"].shape == (9, 32, 32, 3)
+    # The published map is a PNG at 1 m/px; what is generated over it is read as the data set's extended split.
+    satellite = tmp_path / "map.png"
+    cv2.imwrite(str(satellite), scene.levels[0][..., ::-1])
+    generated = ["generate", "--checkpoint", str(out / "last_model.pth"), "--map", str(satellite)]
+    files = ["--h5", str(tmp_path / "extended_queries.h5"), "--database", str(tmp_path / "extended_database.h5")]
+    assert command.main([*generated, *files, "--stride-px", "300"]) == 0
+    extended = {"kind": "boson", "folder": ".", "split": "extended", "map": "map.png", "window_m": 512, "search_radius_m": 0.1}
+    source = open_source(extended, root=tmp_path)
+    satellites, thermals = zip(*(aligned(source[i], 32) for i in range(len(source))), strict=True)
+    assert len(source) == 9
+    painted = generate.paint(checkpoint.load_generator(out / "last_model.pth"), np.stack(satellites), 32)
+    # Twice resized: nearly what the network paints of the ground under the frame, and not of any other.
+    error = np.abs(painted[:, None].astype(float) - np.stack(thermals)[None]).mean((2, 3))
+    assert (error.argmin(1) == np.arange(9)).all()
     assert command.main(generated) == 2
     assert "expected one of --h5 and --thermal-map" in capsys.readouterr().err
     data.write_text(f"[held_out]\n{table}")

@@ -14,11 +14,12 @@ import sys
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import rasterio
 import torch
 from torch.utils.data import ConcatDataset
 
-from ..data import DataError, PairSource, open_source
+from ..data import DataError, PairSource, boson, open_source
 from ..lite.scene import load_map, read_rgb
 from . import generate
 from .checkpoint import TgmError, load_generator, read
@@ -104,8 +105,11 @@ def run_generate(args: argparse.Namespace) -> None:
         raise TgmError(f"{args.map}: expected at least {tile_px} px a side, found {rgb.shape[1]} x {rgb.shape[0]}")
     if args.h5:
         regions = [generate.Region(*region) for region in args.exclude]
-        count = generate.write_extended(net, rgb, args.h5, tile_px, size_px, args.stride_px, regions, args.batch, args.device)
-        print(f"{count} frames")
+        places = generate.write_extended(net, rgb, args.h5, tile_px, size_px, args.stride_px, regions, args.batch, args.device)
+        if args.database:
+            # Only the names of a database file are read: its windows are cropped from the map.
+            boson.write(args.database, (np.zeros((8, 8), np.uint8) for _ in places), places)
+        print(f"{len(places)} frames")
     else:
         gray = generate.thermal_of_map(net, rgb, tile_px, size_px, args.batch, args.device)
         generate.write_thermal_map(gray, args.map, args.thermal_map)
@@ -138,6 +142,9 @@ def main(words: list[str] | None = None) -> int:
     two.add_argument("--checkpoint", type=Path, required=True)
     two.add_argument("--map", type=Path, required=True, help="a GeoTIFF, or the published PNG at 1 m/px")
     two.add_argument("--h5", type=Path, help="extended set in the published layout")
+    two.add_argument(
+        "--database", type=Path, help="with --h5: the file of window centres that its readers want, at the same places"
+    )
     two.add_argument("--thermal-map", type=Path, help="GeoTIFF of the whole map's thermal")
     two.add_argument("--size-px", type=int, help="of the network's square; the checkpoint's, else 512")
     two.add_argument("--width-m", type=float, help="ground under it; the checkpoint's, else 512")

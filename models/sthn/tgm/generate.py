@@ -1,8 +1,7 @@
 """The extended set: thermal painted over ground that no camera has seen.
 
-Two forms: an HDF5 file in the published layout (`image_data` u8 `[N, n, n, 3]`, `image_size`, `image_name`
-"@row@column" of the centre, map pixels), tiles on a lattice of 35 px; or a whole map's thermal as a GeoTIFF on the map's
-own grid, from which any training can cut frames.
+Two forms: an HDF5 file in the published layout (`sthn.data.boson`), tiles on a lattice of 35 px; or a whole map's thermal
+as a GeoTIFF on the map's own grid, from which any training can cut frames.
 """
 
 from __future__ import annotations
@@ -13,13 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
-import h5py
 import numpy as np
 import rasterio
 import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from ..data import boson
 from .checkpoint import TgmError
 from .networks import Generator
 from .pairs import to_pixels, to_unit
@@ -79,29 +78,28 @@ def write_extended(
     excluded: Sequence[Region] = (),
     batch: int = 16,
     device: str = "cpu",
-) -> int:
-    """The extended set of a map -> number of frames. Written beside and renamed: a stopped run leaves no half file.
+) -> list[tuple[int, int]]:
+    """The extended set of a map -> rows and columns of its frames. Written beside and renamed: a stopped run leaves no
+    half file.
 
-    `tile_px`: map pixels under a frame; `size_px`: of the network and of the stored frame.
+    `tile_px`: map pixels under a frame, and of the stored frame; `size_px`: of the network.
     """
     places = list(centres(map_rgb, tile_px, stride_px, excluded))
     if not places:
         raise TgmError(f"{path}: no tile of {tile_px} px lies on valid map outside the excluded regions")
-    unfinished = path.with_suffix(".tmp")
-    with h5py.File(unfinished, "w") as file:
-        shape = (len(places), size_px, size_px, 3)
-        images = file.create_dataset("image_data", shape, np.uint8, chunks=(1, *shape[1:]), compression="lzf")
+    half = tile_px // 2
+
+    def frames() -> Iterator[NDArray[np.uint8]]:
         for first in tqdm(range(0, len(places), batch), "tiles", file=sys.stderr, mininterval=5):
             some = places[first : first + batch]
-            half = tile_px // 2
             tiles = np.stack([map_rgb[r - half : r - half + tile_px, c - half : c - half + tile_px] for r, c in some])
-            images[first : first + len(some)] = np.repeat(paint(net, tiles, size_px, device)[..., None], 3, -1)
-        sizes = np.full((len(places), 2), size_px)
-        file.create_dataset("image_size", data=sizes, chunks=True, maxshape=(None, 2), compression="lzf")
-        names = [f"@{row}@{column}" for row, column in places]
-        file.create_dataset("image_name", data=names, dtype=h5py.string_dtype("utf-8"), compression="lzf")
+            for gray in paint(net, tiles, size_px, device):
+                yield gray if size_px == tile_px else cv2.resize(gray, (tile_px, tile_px), interpolation=cv2.INTER_LINEAR)
+
+    unfinished = path.with_suffix(".tmp")
+    boson.write(unfinished, frames(), places)
     unfinished.replace(path)
-    return len(places)
+    return places
 
 
 def thermal_of_map(

@@ -65,10 +65,3 @@ class AlignedPairs(Dataset):
     def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
         satellite, thermal = aligned(self.source[self.indices[index]], self.size_px)
         return to_unit(satellite), to_unit(thermal)
-
-
-def capped(generated: int, real: int, epoch: int, seed: int) -> NDArray[np.int64]:
-    """Indices into the extended set for one pass over the real one: at most N_T, the number of real frames, drawn anew
-    each pass without repetition (paper, Sec. III-D). The same for the same seed and pass."""
-    order = np.random.default_rng([seed, epoch]).permutation(generated)
-    return order[: min(generated, real)]
