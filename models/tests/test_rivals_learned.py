@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import ROOT
 
 from sthn import geometry, rivals
 from sthn.data.pair import Pair
@@ -146,6 +147,17 @@ def test_another_window_is_refused(trained: Path) -> None:
         rival.match(wide)
 
 
-def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_trains_over_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    world = str(ROOT / "tests/flights/procedural/world.tif")
+    words = ["--window-m", "1024", "--m-per-px", "8", "--search-radius-m", "200", "--side-px", "64", "--batch", "2"]
+    out = tmp_path / "ihn"
+    assert train.main(["ihn", "--maps", world, *words, "--steps", "2", "--out", str(out)]) == 0
+    (rival,) = rivals.available(["ihn"], ihn=out)
+    assert rival.window_m == 1024 and rival.note == "short run, 2 steps"
+    assert json.loads((out / "training.json").read_text())["search_radius_m"] == 200
     assert train.main(["ihn", "--out", str(tmp_path)]) == 2
     assert "expected one of --data and --maps" in capsys.readouterr().err
+    data = tmp_path / "data.toml"
+    data.write_text("[training]\n")
+    assert train.main(["ihn", "--data", str(data), "--out", str(tmp_path)]) == 2
+    assert "train: expected a table, found None" in capsys.readouterr().err

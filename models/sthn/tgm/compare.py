@@ -71,7 +71,8 @@ def main(words: list[str] | None = None) -> None:
     lines = ["| training | frames | pairs | median m | mean m | <= 25 m |", "|---|---|---|---|---|---|"]
     for folder in args.trained:
         net = CoarseTask().net
-        net.load_state_dict(torch.load(folder / "weights.pt", weights_only=True))
+        # Not `weights.pt`: the running average of a short run is mostly its first weights.
+        net.load_state_dict(torch.load(folder / "last.pt", weights_only=True)["net"])
         net.eval()
         for kind, pairs in kinds.items():
             e = errors_m(net, pairs, args.count)
