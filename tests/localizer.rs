@@ -6,6 +6,7 @@ use nightfix::config::{GateSettings, Settings};
 use nightfix::geo::{Enu, LatLon};
 use nightfix::locate::{Answer, EncodedFrame, Localizer, NoFix, Prior, PriorSource, Query, Reason, StageName};
 use nightfix::map::{GeoTiff, MapCache, WindowSpec};
+use nightfix::model::{Integrity, Manifest};
 use nightfix::thermal::{Encoding, FrameError, Pose};
 use support::bundle::{FRAME_PX, Landscape, in_memory, runtime};
 use support::map::{self, MAP_PX};
@@ -22,6 +23,13 @@ impl Bench {
         Self::with_hole(change, |_, _| false)
     }
     fn with_hole(change: impl FnOnce(&mut GateSettings), absent: impl Fn(usize, usize) -> bool) -> Self {
+        Self::with_manifest(change, absent, |_| ())
+    }
+    fn with_manifest(
+        change: impl FnOnce(&mut GateSettings),
+        absent: impl Fn(usize, usize) -> bool,
+        state: impl FnOnce(&mut Manifest),
+    ) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("map.tif");
         map::write(&path, &Landscape::new(11), absent);
@@ -29,7 +37,9 @@ impl Bench {
         let settings = Settings::defaults().unwrap();
         let mut gates = settings.gates.clone();
         change(&mut gates);
-        let localizer = Localizer::new(in_memory(&runtime()), cache(), gates, settings.budget.clone()).unwrap();
+        let mut bundle = in_memory(&runtime());
+        state(&mut bundle.manifest);
+        let localizer = Localizer::new(bundle, cache(), gates, settings.budget.clone()).unwrap();
         Self { localizer, maker: cache(), _folder: folder }
     }
     /// What a nadir camera with image up = true north sees above a position.
@@ -87,6 +97,84 @@ fn a_frame_is_found_on_the_ellipsoid() {
         }
         assert!(answer.latency_ms.contains_key("total"));
     }
+}
+
+#[test]
+fn a_low_frame_is_matched_at_the_scale_the_bundle_states() {
+    // Half of the bundle's footprint.
+    let truth = middle().offset(Enu { east_m: 14.0, north_m: -21.0 });
+    let pose = Pose { gsd_m: Some(0.5), ..nadir() };
+    let cut = |bench: &mut Bench| {
+        let window = bench.maker.window(&WindowSpec { centre: truth, width_m: 64.0, m_per_px: 0.5 }).unwrap();
+        png(128, &window.rgb.chunks_exact(3).map(|p| p[0]).collect::<Vec<u8>>())
+    };
+    let mut fixed = Bench::new(|_| ());
+    let frame = cut(&mut fixed);
+    assert_eq!(reason(&fixed.locate(&frame, pose, prior(middle(), 60.0))), Reason::FootprintTooSmall);
+
+    let mut bench = Bench::with_manifest(|_| (), |_, _| false, |manifest| manifest.scale_range = Some([0.25, 1.0]));
+    let answer = bench.locate(&frame, pose, prior(middle(), 60.0));
+    let fix = answer.outcome.as_ref().unwrap();
+    assert!(fix.position.distance_m(truth) < 3.0, "{} m, {:?}", fix.position.distance_m(truth), answer.evidence);
+    assert_eq!(answer.evidence["matched_scale"], 0.5);
+    // The message's homography and affine are between pixels of 1 m, whatever scale was matched at.
+    let (window, h) = (answer.window.unwrap(), fix.homography);
+    assert_eq!(window.width_m, 192.0);
+    let middle_px = (FRAME_PX as f64 - 1.0) / 2.0;
+    let [x, y] = [0, 1].map(|row| h[row][0] * middle_px + h[row][1] * middle_px + h[row][2]);
+    let [a, b, c, d, e, f] = window.map_affine;
+    let at = map::crs().inverse(a * x + b * y + c, d * x + e * y + f).unwrap();
+    assert!(at.distance_m(fix.position) < 0.02, "{} m", at.distance_m(fix.position));
+    let side = (h[0][0].hypot(h[1][0]) - 1.0).abs();
+    assert!(side < 0.04, "a frame metre is a window metre: {h:?}");
+    // D_C shrinks with it.
+    assert_eq!(reason(&bench.locate(&frame, pose, prior(middle(), 64.5))), Reason::PriorTooWide);
+    // A frame that shows enough is matched as ever.
+    let whole = bench.frame(truth);
+    assert_eq!(bench.locate(&whole, nadir(), prior(middle(), 128.0)).window.unwrap().width_m, 384.0);
+}
+
+/// A calibration that knows one cue: the probability falls with the peak's mass.
+fn calibration(p: [f64; 2]) -> Integrity {
+    let text = format!(
+        "data = \"a\"\ncommand = \"b\"\ntrials = 9\nbound_m = 25.0\nbias = 0.0\nprobability = {{ scores = [-9.0, 9.0], p = {p:?} }}\n\
+         sigma = {{ bias = 0.7, least_m = 0.5, most_m = 9.0, tail999 = 4.5 }}\n\
+         cues = [{{ name = \"peak_mass\", transform = \"logit\", low = -9.0, high = 9.0, weight = -1.0, sigma_weight = 0.0 }}]"
+    );
+    toml::from_str(&text).unwrap()
+}
+
+#[test]
+fn a_calibrated_bundle_states_its_error_and_its_gate_closes() {
+    let truth = middle().offset(Enu { east_m: 20.0, north_m: 0.0 });
+    let mut bench = Bench::with_manifest(|_| (), |_, _| false, |m| m.integrity = Some(calibration([0.001, 0.001])));
+    let frame = bench.frame(truth);
+    let answer = bench.locate(&frame, nadir(), prior(middle(), 128.0));
+    let fix = answer.outcome.as_ref().unwrap();
+    assert_eq!((fix.calibrated, fix.p_over_25m), (true, Some(0.001)));
+    assert!((answer.evidence["sigma_match_m"] - 0.7f64.exp()).abs() < 1e-9);
+    assert!((fix.radius999_m / fix.covariance_enu_m2[0][0].sqrt() - 4.5).abs() < 1e-9);
+    for cue in ["crop_spread_m", "cycle_m", "cycle_mass", "gradient_agreement", "frame_texture", "map_texture", "mode_share"] {
+        assert!(answer.evidence.get(cue).is_some_and(|v| v.is_finite()), "{cue}: {:?}", answer.evidence);
+    }
+    // An unknown yaw was not part of any calibration.
+    let turned = bench.locate(&frame, Pose { yaw_deg: None, ..nadir() }, prior(middle(), 128.0));
+    let turned = turned.outcome.unwrap();
+    assert_eq!((turned.calibrated, turned.p_over_25m), (false, None));
+
+    let doubtful = |m: &mut Manifest| m.integrity = Some(calibration([0.5, 0.5]));
+    let mut bench = Bench::with_manifest(|_| (), |_, _| false, doubtful);
+    assert_eq!(reason(&bench.locate(&frame, nadir(), prior(middle(), 128.0))), Reason::LowEvidence);
+    let mut open = Bench::with_manifest(|gates| gates.enabled = false, |_, _| false, doubtful);
+    assert_eq!(open.locate(&frame, nadir(), prior(middle(), 128.0)).outcome.unwrap().p_over_25m, Some(0.5));
+    // A cue that is missing closes the gate: what was not seen is not safe.
+    let unknown = |m: &mut Manifest| {
+        let mut table = calibration([0.001, 0.001]);
+        table.cues[0].name = "not_there".into();
+        m.integrity = Some(table);
+    };
+    let mut bench = Bench::with_manifest(|_| (), |_, _| false, unknown);
+    assert_eq!(reason(&bench.locate(&frame, nadir(), prior(middle(), 128.0))), Reason::LowEvidence);
 }
 
 #[test]

@@ -28,6 +28,9 @@ pub struct FixMessage {
     /// Why not; absent with a fix.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reason: Option<Reason>,
+    /// With gates off: the reason for which they would have withheld this fix.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub withheld: Option<Reason>,
     /// The reason in words: what was expected, what was found; absent with a fix.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub detail: Option<String>,
@@ -150,6 +153,7 @@ impl FixMessage {
             seq,
             status: if fix.is_some() { Status::Fix } else { Status::NoFix },
             reason: no_fix.map(|n| n.reason),
+            withheld: answer.withheld,
             detail: no_fix.map(|n| n.detail.clone()),
             lat_deg: fix.map(|f| f.position.lat_deg),
             lon_deg: fix.map(|f| f.position.lon_deg),

@@ -111,6 +111,7 @@ fn answer(
         // Too late already: the time is better spent on the next frame. An earlier reason goes first.
         let no_fix = query.prior.as_ref().err().cloned().unwrap_or_else(|| late(waited, deadline));
         Answer {
+            withheld: None,
             searched: false,
             outcome: Err(no_fix),
             prior: query.prior.ok(),

@@ -54,6 +54,7 @@ fn locate(query: &Query<'_>) -> Answer {
         }),
     };
     Answer {
+        withheld: None,
         searched: false,
         outcome,
         prior: query.prior.as_ref().ok().copied(),

@@ -25,6 +25,7 @@ impl Outbox {
     /// Nothing to send. Who asks is told that no prior was there yet: stamped with the start, message 0.
     pub fn new(health: &Health) -> Self {
         let none = Answer {
+            withheld: None,
             searched: false,
             outcome: Err(NoFix { reason: Reason::NoPrior, detail: "frame: expected one, found none since the start".to_owned() }),
             prior: None,

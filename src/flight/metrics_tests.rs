@@ -17,6 +17,7 @@ fn message(fix: Option<LatLon>, reason: Option<Reason>, homography: Option<[[f64
         seq: 0,
         status: if fix.is_some() { Status::Fix } else { Status::NoFix },
         reason,
+        withheld: None,
         detail: None,
         lat_deg: fix.map(|f| f.lat_deg),
         lon_deg: fix.map(|f| f.lon_deg),

@@ -35,6 +35,7 @@ impl Locate for Echo {
         Answer {
             outcome,
             prior,
+            withheld: None,
             searched: false,
             window,
             evidence: Default::default(),

@@ -108,6 +108,8 @@ pub type Latency = BTreeMap<String, f64>;
 pub struct Answer {
     /// The outcome.
     pub outcome: Result<Fix, NoFix>,
+    /// With gates off: the gate that would have closed.
+    pub withheld: Option<Reason>,
     /// The prior that was used.
     pub prior: Option<Prior>,
     /// Whether it was found by a search beyond the bundle's D_C: never published before another frame confirms it.

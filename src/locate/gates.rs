@@ -4,7 +4,7 @@ use super::{Evidence, FrameView, NoFix, Reason};
 use crate::config::GateSettings;
 use crate::homography::{Expected, Homography, Quad, check};
 use crate::map::Window;
-use crate::model::{Integrity, Judgement};
+use crate::model::{Judgement, MissingCue};
 
 /// Points along a side of the grid on which the map under a quad is probed.
 const PROBES: usize = 96;
@@ -112,26 +112,23 @@ pub fn judge_evidence(evidence: &Evidence, settings: &GateSettings) -> Result<()
     Ok(())
 }
 
-/// `low_evidence` by the bundle's calibration: what it says of the evidence, or the reason that it closes. Tested last, so
-/// that two peaks are `ambiguous` and not merely improbable. `None` where the bundle is not calibrated.
+/// `low_evidence` by the bundle's calibration: what it says, or the cue that is missing. Tested last, so that two peaks are
+/// `ambiguous` and not merely improbable. Nothing to test where the bundle is not calibrated.
 pub fn judge_probability(
-    integrity: Option<&Integrity>,
-    evidence: &Evidence,
+    judgement: Option<&Result<Judgement, MissingCue>>,
+    bound_m: f64,
     settings: &GateSettings,
-) -> Result<Option<Judgement>, NoFix> {
-    let Some(integrity) = integrity else { return Ok(None) };
-    let judgement = match integrity.judge(evidence) {
-        Ok(judgement) => judgement,
-        // Without gates an answer is wanted; that it is not calibrated is said.
-        Err(_) if !settings.enabled => return Ok(None),
-        Err(missing) => return Err(NoFix::new(Reason::LowEvidence, missing.to_string())),
-    };
-    let (p, most) = (judgement.p_over_bound, settings.max_p_over_25m);
-    if settings.enabled && !(p <= most) {
-        let detail = format!("probability of an error above {} m: expected at most {most}, found {p:.4}", integrity.bound_m);
-        return Err(NoFix::new(Reason::LowEvidence, detail));
+) -> Result<(), NoFix> {
+    let most = settings.max_p_over_25m;
+    match judgement {
+        None => Ok(()),
+        Some(Err(missing)) => Err(NoFix::new(Reason::LowEvidence, missing.to_string())),
+        Some(Ok(found)) if found.p_over_bound <= most => Ok(()),
+        Some(Ok(Judgement { p_over_bound: p, .. })) => {
+            let detail = format!("probability of an error above {bound_m} m: expected at most {most}, found {p:.4}");
+            Err(NoFix::new(Reason::LowEvidence, detail))
+        }
     }
-    Ok(Some(judgement))
 }
 
 #[cfg(test)]

@@ -83,7 +83,7 @@ impl Localizer {
 
     /// As [`Localizer::locate`], and what was looked at.
     pub fn locate_seen(&mut self, query: &Query<'_>) -> (Answer, Seen) {
-        let mut on_the_way = OnTheWay { prior: None, window: None, evidence: Evidence::new(), seen: Seen::default() };
+        let mut on_the_way = OnTheWay::default();
         let mut steps = Steps::start();
         let mut total = Steps::start();
         let outcome = self.answer(query, &mut on_the_way, &mut steps);
@@ -93,8 +93,8 @@ impl Localizer {
         for (name, ms) in steps.taken.iter().chain(&total.taken) {
             *latency_ms.entry((*name).to_owned()).or_insert(0.0) += ms;
         }
-        let OnTheWay { prior, window, evidence, seen } = on_the_way;
-        (Answer { outcome, prior, searched: false, window, evidence, latency_ms }, seen)
+        let OnTheWay { prior, window, evidence, seen, withheld } = on_the_way;
+        (Answer { outcome, withheld, prior, searched: false, window, evidence, latency_ms }, seen)
     }
 
     /// The bundle.
@@ -185,13 +185,20 @@ impl Localizer {
             way.evidence.insert("mode_share".into(), 1.0 / (1.0 + second));
         }
         steps.done("cues");
-        if self.gates.enabled {
-            judge_quad(&found.quad, self.bundle.manifest.frame_width_m, search.yaw_known, &self.gates)?;
-            judge_distance(position.distance_m(prior.position), prior.radius_m)?;
-            judge_map(map_valid, &self.gates)?;
-            judge_evidence(&way.evidence, &self.gates)?;
+        let integrity = self.bundle.manifest.integrity.as_ref();
+        let judgement = integrity.map(|table| table.judge(&way.evidence));
+        let judged = judge_quad(&found.quad, self.bundle.manifest.frame_width_m, search.yaw_known, &self.gates)
+            .and_then(|()| judge_distance(position.distance_m(prior.position), prior.radius_m))
+            .and_then(|()| judge_map(map_valid, &self.gates))
+            .and_then(|()| judge_evidence(&way.evidence, &self.gates))
+            .and_then(|()| judge_probability(judgement.as_ref(), integrity.map_or(0.0, |table| table.bound_m), &self.gates));
+        if let Err(no_fix) = judged {
+            if self.gates.enabled {
+                return Err(no_fix);
+            }
+            way.withheld = Some(no_fix.reason);
         }
-        let judgement = judge_probability(self.bundle.manifest.integrity.as_ref(), &way.evidence, &self.gates)?;
+        let judgement = judgement.and_then(Result::ok);
         // The calibration was made with a known yaw (a search of the circle tries thirty times as many hypotheses) and at
         // the bundle's own scale.
         let judgement = judgement.filter(|_| search.yaw_known && scale == 1.0);
@@ -352,7 +359,9 @@ fn homography_at_metres(found: &Homography, scale: f64, frame_px: usize) -> Homo
 }
 
 /// What is known on the way, whichever gate closes.
+#[derive(Default)]
 struct OnTheWay {
+    withheld: Option<Reason>,
     prior: Option<Prior>,
     window: Option<WindowInfo>,
     evidence: Evidence,

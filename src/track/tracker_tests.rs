@@ -29,7 +29,15 @@ fn sigma(stamp_ns: i64, east_m: f64, sigma_m: f64) -> PriorReport {
 }
 
 fn answer(outcome: Result<Fix, NoFix>, prior: Option<Prior>) -> Answer {
-    Answer { outcome, prior, searched: false, window: None, evidence: BTreeMap::new(), latency_ms: BTreeMap::new() }
+    Answer {
+        outcome,
+        withheld: None,
+        prior,
+        searched: false,
+        window: None,
+        evidence: BTreeMap::new(),
+        latency_ms: BTreeMap::new(),
+    }
 }
 
 fn fix(east_m: f64, sigma_m: f64, prior: Option<Prior>) -> Answer {

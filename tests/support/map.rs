@@ -29,7 +29,12 @@ pub fn write(path: &Path, land: &Landscape, absent: impl Fn(usize, usize) -> boo
     image.write_data(&pixels).unwrap();
 }
 
+/// Its coordinate system.
+pub fn crs() -> Crs {
+    Crs::from_epsg(u32::from(EPSG)).unwrap()
+}
+
 /// The position of a map pixel's centre.
 pub fn position(x: f64, y: f64) -> LatLon {
-    Crs::from_epsg(u32::from(EPSG)).unwrap().inverse(ORIGIN[0] + x + 0.5, ORIGIN[1] - y - 0.5).unwrap()
+    crs().inverse(ORIGIN[0] + x + 0.5, ORIGIN[1] - y - 0.5).unwrap()
 }

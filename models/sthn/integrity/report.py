@@ -1,10 +1,10 @@
 """The integrity report: is the error that is stated the error that is made?
 
-    python -m sthn.integrity.report --off target/integrity/test-off.csv --on target/integrity/test-on.csv \
-        --bundle models/bundles/lite-1536 --out models/reports/integrity
+    python -m sthn.integrity.report --trials target/integrity/test.csv --bundle models/bundles/lite-1536 \
+        --out models/reports/integrity
 
-`--off` are trials with gates off (curves of each cue, calibration, risk and coverage), `--on` the same flights as the service
-answers them. Writes README.md, numbers.json and two pictures.
+The trials have an answer for every frame, with the reason for which the gates would have withheld it: what has none is what
+the service publishes. Writes README.md, numbers.json and two pictures.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def calibration_bins(p: np.ndarray, wrong: np.ndarray) -> list[dict]:
     return bins
 
 
-def measure(off: dict[str, np.ndarray], on: dict[str, np.ndarray], bundle: Path) -> dict:
+def measure(off: dict[str, np.ndarray], bundle: Path) -> dict:
     """All numbers."""
     table = tomllib.loads((bundle / "bundle.toml").read_text())["integrity"]
     evidence = evidence_of(off)
@@ -116,9 +116,12 @@ def measure(off: dict[str, np.ndarray], on: dict[str, np.ndarray], bundle: Path)
     numbers["risk_coverage"] = [
         {"coverage": c, "risk_over_25m": float(risk[max(0, int(c * len(order)) - 1)])} for c in (0.25, 0.5, 0.75, 0.9, 0.95, 1.0)
     ]
+    # As the service answers: what has a reason is withheld. `exact` flights are those of the match alone.
+    served = ~np.char.startswith(off["flight"], "exact")
+    on = {name: column[served] for name, column in off.items()}
     texture = evidence_of(on)["frame_texture"]
     localisable = (on["category"] == "localisable") & ((texture >= MIN_TEXTURE) | ~np.isfinite(texture))
-    fixed = on["status"] == "fix"
+    fixed = (on["status"] == "fix") & (on["reason"] == "")
     accepted = localisable & fixed
     service = own_fixes(on, fixed & np.isin(on["category"], ("localisable", "water")))
     beyond = int((on["error_m"][accepted] > 50).sum())
@@ -259,18 +262,17 @@ def main(words: list[str] | None = None) -> None:
     """The command line."""
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(prog="sthn.integrity.report", description=__doc__, formatter_class=raw)
-    parser.add_argument("--off", type=Path, required=True)
-    parser.add_argument("--on", type=Path, required=True)
+    parser.add_argument("--trials", type=Path, required=True, help="CSV of `sthn.integrity.trials`")
     parser.add_argument("--bundle", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args(words)
-    off, on = read_trials(args.off), read_trials(args.on)
-    numbers = measure(off, on, args.bundle)
+    trials = read_trials(args.trials)
+    numbers = measure(trials, args.bundle)
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "numbers.json").write_text(json.dumps(numbers, indent=1) + "\n")
-    command = f"python -m sthn.integrity.report --off {args.off} --on {args.on} --bundle {args.bundle} --out {args.out}"
+    command = f"python -m sthn.integrity.report --trials {args.trials} --bundle {args.bundle} --out {args.out}"
     (args.out / "README.md").write_text(text(numbers, command))
-    pictures(off, numbers, args.out)
+    pictures(trials, numbers, args.out)
     print(text(numbers, command))
 
 

@@ -164,7 +164,7 @@ def spoil(frames: list[Path], kind: str, seed: int, thermal: Path) -> None:
 
 
 def run(flight: Flight, args: argparse.Namespace) -> list[dict]:
-    """Makes and replays a flight, gates off or on; its rows."""
+    """Makes and replays a flight; its rows."""
     folder = args.work / flight.name
     done = folder / "done"
     if not done.exists():
@@ -182,8 +182,8 @@ def run(flight: Flight, args: argparse.Namespace) -> list[dict]:
         done.touch()
     kind = flight.source.partition(":")[0]
     map_path = args.maps / (flight.over or flight.source) if kind != "world" or flight.over else folder / "world.tif"
-    out = folder / f"replay-{args.gates}-{args.bundle.name}"
-    gates = ["--gates", "off"] if args.gates == "off" else []
+    out = folder / f"replay-{args.bundle.name}"
+    # Gates off: an answer for every frame, and the reason for which the gates would have withheld it.
     call(
         [
             str(args.nightfix),
@@ -195,7 +195,8 @@ def run(flight: Flight, args: argparse.Namespace) -> list[dict]:
             str(args.bundle),
             "--out",
             str(out),
-            *gates,
+            "--gates",
+            "off",
         ]
     )
     return read(flight, folder, out)
@@ -292,7 +293,7 @@ def read(flight: Flight, folder: Path, out: Path) -> list[dict]:
             "radius_m": flight.radius_m,
             "water_share": water,
             "status": fix["status"],
-            "reason": fix.get("reason", ""),
+            "reason": fix.get("reason") or fix.get("withheld", ""),
             "error_m": math.nan if fix["error_m"] is None else fix["error_m"],
             "sigma_m": math.sqrt(fix["covariance_enu_m2"][0][0]) if "covariance_enu_m2" in fix else math.nan,
             "radius95_m": fix.get("radius95_m", math.nan),
@@ -323,7 +324,6 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--thermal", type=Path, help="folder of real frames of other places; by default beside --maps")
     parser.add_argument("--out", type=Path, required=True, help="CSV")
     parser.add_argument("--work", type=Path, default=Path("target/integrity/flights"))
-    parser.add_argument("--gates", choices=["off", "on"], default="off")
     parser.add_argument("--nightfix", type=Path, default=Path("target/release/nightfix"))
     parser.add_argument("--only", nargs="+", help="flights whose names start so")
     args = parser.parse_args(words)
