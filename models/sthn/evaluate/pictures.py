@@ -96,7 +96,7 @@ def _draw(axis: Axes, tile: Tile) -> None:
     half = tile.record.picture_width_m / 2
     axis.imshow(tile.image("satellite"), extent=(-half, half, half, -half))
     # The thickest first: where all agree each is still seen.
-    for quad, colour, width in ((tile.record.truth, TRUTH, 3.6), (tile.score.coarse, COARSE, 2.2), (tile.score.quad, FINAL, 0.9)):
+    for quad, colour, width in ((tile.record.truth, TRUTH, 3.6), (tile.score.coarse, COARSE, 2.2), (tile.score.quad, FINAL, 1.2)):
         if quad is not None:
             outline(axis, quad, colour, width)
     shown = min(tile.window_m, tile.record.picture_width_m) / 2

@@ -84,13 +84,16 @@ class LandCover:
 
     def shares(self, lat_deg: float, lon_deg: float, yaw_deg: float) -> dict[int, float]:
         """Of each class in the square of 512 m about a place, image up to `yaw_deg`; outside the map is class 0."""
-        x, y = self.inverse * self.to_map.transform(lon_deg, lat_deg)
+        easting, northing = self.to_map.transform(lon_deg, lat_deg)
+        a, b, c, d, e, f = self.inverse[:6]
+        x, y = a * easting + b * northing + c, d * easting + e * northing + f
         step = FRAME_M / GRID / self.step_m
         turn = np.radians(yaw_deg)
-        c, s = np.cos(turn) * step, np.sin(turn) * step
+        along, across = np.cos(turn) * step, np.sin(turn) * step
         middle = (GRID - 1) / 2
         # Grid cell -> map px; rasterio's px are edges.
-        matrix = np.array([[c, -s, x - 0.5 - (c - s) * middle], [s, c, y - 0.5 - (s + c) * middle]])
+        left, top = x - 0.5 - (along - across) * middle, y - 0.5 - (across + along) * middle
+        matrix = np.array([[along, -across, left], [across, along, top]])
         flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
         cut = cv2.warpAffine(self.classes, matrix, (GRID, GRID), flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
         values, counts = np.unique(cut, return_counts=True)
@@ -211,9 +214,7 @@ def main(arguments: list[str] | None = None) -> int:
             command, noise = stored["command"], stored["noise"]
         else:
             command, noise = "python -m sthn.evaluate.terrain " + shlex.join(words), o.noise
-            frames = flights(o)
-            rows = [dataclasses.asdict(frame) for frame in frames]
-            (o.out / "frames.json").write_text(json.dumps({"command": command, "noise": noise, "frames": rows}) + "\n")
+            frames = flights(o, command)
     except (ValueError, OSError, KeyError, TypeError) as error:
         print(f"terrain: {error}", file=sys.stderr)
         return 2
@@ -224,8 +225,8 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def flights(o: argparse.Namespace) -> list[Frame]:
-    """All flights of the options."""
+def flights(o: argparse.Namespace, command: str) -> list[Frame]:
+    """All flights of the options; `frames.json` grows with each."""
     maps = [p for m in o.maps for p in (sorted(m.glob("*.tif")) if m.is_dir() else [m]) if not p.stem.endswith("_classes")]
     if missing := [p for m in maps if not (p := m.with_name(f"{m.stem}_classes.tif")).is_file()]:
         raise ValueError(f"{missing[0]}: expected the land cover of its map, found nothing")
@@ -241,6 +242,8 @@ def flights(o: argparse.Namespace) -> list[Frame]:
     frames: list[Frame] = []
     for seen, known, name, terrain, classes in tqdm(jobs, file=sys.stderr):
         frames += fly(o.nightfix, o.bundle, seen, known, o.out / name, words, terrain, classes)
+        stored = {"command": command, "noise": o.noise, "frames": [dataclasses.asdict(frame) for frame in frames]}
+        (o.out / "frames.json").write_text(json.dumps(stored) + "\n")
     return frames
 
 
