@@ -170,6 +170,21 @@ def test_map_pairs_are_seeded_and_fill_the_disc(satellite: Path) -> None:
     assert abs(shifts.mean(0)).max() < 60
 
 
+def test_a_style_is_one_curve_for_all_frames(satellite: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sthn.lite.thermal.sensor", lambda values, *_: (values - values.min()) / np.ptp(values))
+    spec = {"kind": "maps", "maps": [str(satellite)], "count": 9, "window_m": 64, "search_radius_m": 9, "m_per_px": 8.0}
+
+    def along(style: int | None, index: int) -> float:
+        """Correlation of frame and map where they lie on one another."""
+        pair = open_source(spec | {"frame_px": 64} | ({} if style is None else {"style": style}))[index]
+        size = (64, 64)
+        under = cv2.warpPerspective(pair.satellite[..., 0], pair.homography, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        return float(np.corrcoef(under[4:-4, 4:-4].ravel(), pair.thermal[4:-4, 4:-4].ravel())[0, 1])
+
+    one = [along(2, i) for i in range(6)]
+    assert np.std(one) < 0.15 < np.std([along(None, i) for i in range(6)])
+
+
 def test_the_committed_flight_opens() -> None:
     flight = ROOT / "tests/flights/procedural"
     spec = {"kind": "flight", "folder": str(flight), "map": str(flight / "world.tif"), "window_m": 1024, "search_radius_m": 300}

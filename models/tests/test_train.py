@@ -309,6 +309,24 @@ def test_each_net_is_clipped_apart(place: Path, monkeypatch) -> None:
         assert norm == pytest.approx(0.001, rel=1e-2)
 
 
+def test_a_step_without_finite_gradients_is_left_out(place: Path, monkeypatch) -> None:
+    """Three corners in a line: the published code drops such an increment; here the step changes nothing."""
+    made = experiment.read(place / "e.toml")
+    source = Numbered("real", 4)
+    run = loop.Loop(SthnTask(Sthn(TINY)), made, source, source, None, place / "nan", loop.make_fabric("32-true", "cpu"))
+    before = {key: value.clone() for key, value in run.task.state_dict().items()}
+    truth = torch.full((2, 2, 2, 2), 3.0)
+    handle = run.task.network.netG.fnet1.conv1.weight.register_hook(lambda gradient: gradient * float("nan"))
+    run._train_step(*images(2, 64, 32), truth)
+    assert run.step == 1 and all(torch.equal(value, before[key]) for key, value in run.task.state_dict().items())
+    monkeypatch.setattr(loop, "MOST_LEFT_OUT", 2)
+    with pytest.raises(loop.TrainingError, match="step 1: expected finite gradients"):
+        run._train_step(*images(2, 64, 32), truth)
+    handle.remove()
+    run._train_step(*images(2, 64, 32), truth)
+    assert any(not torch.equal(value, before[key]) for key, value in run.task.state_dict().items())
+
+
 def test_it_learns_a_batch_by_heart() -> None:
     """Both stages, without augmentation: far below identity within seconds."""
     torch.manual_seed(3)
@@ -381,3 +399,28 @@ def test_every_experiment_of_the_paper_has_a_file_that_says_what_its_name_says()
     assert {made[f"ablations/box-{kind}"].box.kind for kind in ("none", "widen", "full")} == {"none", "widen", "full"}
     assert made["ablations/box-paper"].box.rule == "paper"
     assert all("extended" not in made[f"ablations/without-tgm-ws512-dc{radius}"].data for radius in (50, 64, 128, 256, 512))
+
+
+def test_an_experiment_of_the_paper_trains_on_the_published_layout(tmp_path: Path) -> None:
+    """The committed file as it is, but for sizes: files in the released layout in, a checkpoint out."""
+    from sthn.data import boson
+
+    folder = tmp_path / "data" / "v3"
+    folder.mkdir(parents=True)
+    pixels = np.random.default_rng(0).integers(1, 255, (700, 760, 3), dtype=np.uint8)
+    (folder.parent / boson.MAP_NAME).parent.mkdir(parents=True)
+    cv2.imwrite(str(folder.parent / boson.MAP_NAME), pixels)
+    for split in ("train", "val", "extended"):
+        name = "extended_queries_test_excluded" if split == "extended" else f"{split}_queries"
+        boson.write(folder / f"{name}.h5", [pixels[:512, :512, 0]] * 2, [(300, 330), (340, 400)])
+        boson.write(folder / f"{split}_database.h5", [np.zeros((4, 4), np.uint8)] * 2, [(310, 330), (345, 390)])
+    small = ["network.resize_width=32", "network.iterations=1", "training.steps=1", "training.batch=2", "training.workers=0"]
+    words = [str(ROOT / "models/experiments/table-1/ws512-dc64.toml"), "--out", str(tmp_path / "run"), "--accelerator", "cpu"]
+    for override in [f'data.root="{folder.parent}"', 'data.folder="v3"', *small]:
+        words += ["--set", override]
+    assert main(words) == 0
+    assert load_checkpoint(tmp_path / "run/final").config.database_size == 512
+    (folder / "extended_queries_test_excluded.h5").rename(folder / "extended_queries.h5")
+    words[2] = str(tmp_path / "refused")
+    assert main(words) == 2, "the extended set with the test region"
+    assert main([*words, "--set", "data.extended=false"]) == 0

@@ -48,6 +48,7 @@ class MapPairs:
         augment: bool = False,
         surround: bool = False,
         name: str = "maps",
+        style: int | None = None,
     ) -> None:
         if not maps:
             raise DataError(name, "maps", "at least one map", "none")
@@ -56,7 +57,7 @@ class MapPairs:
                 raise DataError(name, key, f"at least {least}", value)
         self.maps, self.window_m, self.search_radius_m = maps, window_px, float(search_radius_m)
         self.count, self.seed, self.m_per_px, self.frame_px = count, seed, m_per_px, frame_px
-        self.augment, self.surround, self.name = augment, surround, name
+        self.augment, self.surround, self.name, self.style = augment, surround, name, style
         areas = np.array([m.size[0] * m.size[1] * m.m_per_px**2 for m in maps])
         self._share = areas / areas.sum()
 
@@ -108,7 +109,11 @@ class MapPairs:
         if place.classes is not None:
             flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
             classes = cv2.warpPerspective(place.classes, to_seen, (seen_px, seen_px), flags=flags)
-        gray = thermal.sensor(thermal.render(seen, classes, self.m_per_px, rng), self.m_per_px, rng)
+        if self.style is None:
+            values = thermal.render(seen, classes, self.m_per_px, rng)
+        else:
+            values = thermal.tone_curve(seen.astype(np.float32) / 255, np.random.default_rng(self.style))
+        gray = thermal.sensor(values, self.m_per_px, rng)
         gray = np.round(gray * 255).astype(np.uint8)
         window = scene.cut(place.levels, to_window @ centred(self.window_m), self.window_m)
         if self.augment:

@@ -10,7 +10,7 @@
     kind = "maps"                     # maps alone, thermal synthesised
     maps = ["A.tif", "B.tif"]         # or one folder
     count = 1000                      # pairs a pass
-    # seed, m_per_px = 1.0, frame_px = 512, augment = false, surround (set where there is noise)
+    # seed, m_per_px = 1.0, frame_px = 512, augment = false, surround (set where there is noise), style
 
     kind = "flight"                   # a recorded flight with truth
     folder = "flights/a"
@@ -37,7 +37,7 @@ from .pair import Noise, Pair, PairSource
 COMMON = {"kind": str, "window_m": int, "search_radius_m": float, "seed": int, "count": int, "noise": Mapping, "name": str}
 KEYS: dict[str, dict[str, type]] = {
     "boson": {"folder": str, "split": str, "map": str, "pairs": str, "allow_test_region": bool},
-    "maps": {"maps": list, "m_per_px": float, "frame_px": int, "augment": bool, "surround": bool},
+    "maps": {"maps": list, "m_per_px": float, "frame_px": int, "augment": bool, "surround": bool, "style": int},
     "flight": {"folder": str, "map": str, "m_per_px": float, "own_priors": bool},
 }
 NOISE_KEYS = {"rotation_deg": float, "scale": float, "perspective_px": float, "kind": str}
@@ -146,6 +146,8 @@ def _maps(spec: Mapping[str, Any], where: str, root: Path, purpose: boson.Purpos
         spec.get("frame_px", 512),
         spec.get("augment", False),
         spec.get("surround", noisy),
+        spec.get("name", "maps"),
+        spec.get("style"),
     )
 
 

@@ -86,8 +86,8 @@ class Experiment:
     noise: Noise
     """Of the training pairs. Validation has none unless its own table says so."""
     data: dict[str, Any]
-    """`root`, and tables `train`, `validation` and, for the generated set, `extended` (`sthn.data.spec`); `extended = false`
-    takes a base's away."""
+    """`root`; `folder` and `map` of all published splits; tables `train`, `validation` and, for the generated set, `extended`
+    (`sthn.data.spec`); `extended = false` takes a base's away."""
     seed: int = 0
 
     @property
@@ -106,6 +106,8 @@ class Experiment:
     def source_table(self, name: Literal["train", "validation", "extended"]) -> dict[str, Any]:
         """A source's table with what the experiment says once."""
         table = {"window_m": self.window_m, "search_radius_m": self.search_radius_m} | self.data[name]
+        if table.get("kind") == "boson":
+            table = {key: self.data[key] for key in ("folder", "map") if key in self.data} | table
         if name != "validation" and self.noise.kinds:
             table.setdefault("noise", dataclasses.asdict(self.noise))
         return table
@@ -147,7 +149,11 @@ def parse(document: dict[str, Any], where: str) -> Experiment:
     tables = {name: _table(kind, document.get(name, {}), f"{where}: {name}") for name, kind in TABLES.items()}
     if document["data"].get("extended") is False:
         document["data"].pop("extended")
-    check(document["data"], {"root": str, "train": dict, "validation": dict, "extended": dict}, f"{where}: data")
+    check(
+        document["data"],
+        {"root": str, "folder": str, "map": str, "train": dict, "validation": dict, "extended": dict},
+        f"{where}: data",
+    )
     for name in ("train", "validation"):
         if name not in document["data"]:
             raise DataError(f"{where}: data", name, "a table", "nothing")

@@ -32,8 +32,15 @@ SCHEDULE_SPARE = 100
 
 SHEET_PAIRS = 4
 
+MOST_LEFT_OUT = 50
+"""Steps in a row without finite gradients after which a training has failed."""
+
 CURVE = ("step", "seconds", "lr", "loss", "loss_coarse", "loss_fine", "mace_coarse_m", "mace_m")
 VALIDATION = ("step", "seconds", "identity_m", "mace_coarse_m", "mace_m")
+
+
+class TrainingError(ValueError):
+    """A training that cannot go on."""
 
 
 class Loop:
@@ -70,7 +77,7 @@ class Loop:
             cycle_momentum=False,
             anneal_strategy="linear",
         )
-        self.step, self.spent_s, self.best_m = 0, 0.0, float("inf")
+        self.step, self.spent_s, self.best_m, self.left_out = 0, 0.0, float("inf"), 0
 
     def resume(self, path: Path) -> None:
         """Goes on from a checkpoint."""
@@ -109,13 +116,15 @@ class Loop:
                 lr = self.schedule.get_last_lr()[0]
                 found = self._train_step(window, thermal, truth)
                 bar.update()
-                for key, value in self._columns(found, truth).items():
-                    sums[key] += value
-                counted += 1
+                if torch.isfinite(found["loss"]):
+                    for key, value in self._columns(found, truth).items():
+                        sums[key] += value
+                    counted += 1
                 seconds = self.spent_s + time.monotonic() - began
                 last = self.step == self.table.steps
                 if self.step % self.table.log_every == 0 or last:
-                    row = {key: value / counted for key, value in sums.items()}
+                    means = torch.tensor([value / max(counted, 1) for value in sums.values()], dtype=torch.float64)
+                    row = dict(zip(sums, self.fabric.all_reduce(means).tolist(), strict=True))
                     bar.set_postfix(mace_m=f"{row['mace_m']:.2f}")
                     if chief:
                         _append(self.out / "curve.csv", [self.step, f"{seconds:.1f}", f"{lr:.4g}", *_numbers(row.values())])
@@ -138,13 +147,18 @@ class Loop:
         generator = torch.Generator().manual_seed(int(words.generate_state(1, np.uint64)[0] >> 1))
         drawn = box.draw(self.experiment.box, window.shape[0], generator).to(truth.device)
         found = self.module(window, thermal, truth, drawn)
-        if not torch.isfinite(found["loss"]):
-            raise FloatingPointError(f"step {self.step}: loss: expected a finite number, found {found['loss'].item()}")
         self.optimiser.zero_grad()
         self.fabric.backward(found["loss"])
-        for net in self.task.nets().values():
-            nn.utils.clip_grad_norm_(net.parameters(), self.table.clip)
-        self.optimiser.step()
+        norms = [nn.utils.clip_grad_norm_(net.parameters(), self.table.clip) for net in self.task.nets().values()]
+        # Three corners in a line give a homography that is not finite. Gradients are already those of all processes, so
+        # that all of them leave the step out together.
+        if torch.isfinite(torch.stack(norms)).all():
+            self.optimiser.step()
+            self.left_out = 0
+        else:
+            self.left_out += 1
+            if self.left_out >= MOST_LEFT_OUT:
+                raise TrainingError(f"step {self.step}: expected finite gradients, found none in {self.left_out} steps")
         self.schedule.step()
         self.step += 1
         return found

@@ -65,7 +65,7 @@ class Fixed(Dataset):
 def tensors(pair: Pair, side_px: int) -> Batch:
     """A pair as the loop takes it; bytes, for the device to convert."""
     truth = torch.from_numpy(pair.displacement(side_px).astype(np.float32))
-    return torch.from_numpy(np.ascontiguousarray(pair.satellite)), torch.from_numpy(np.ascontiguousarray(pair.thermal)), truth
+    return torch.from_numpy(np.array(pair.satellite)), torch.from_numpy(np.array(pair.thermal)), truth
 
 
 class Steps:
