@@ -121,6 +121,8 @@ def _notes(entries: list[Entry], quoted: bool) -> list[str]:
     notes = [f"{count} pairs a column of {', '.join(sources)}, the same in every row."]
     if counts[0] < LEAST_PAIRS:
         notes.append(f"Fewer than {LEAST_PAIRS} pairs: a P99 is not more than the largest error.")
+    if any(e.results.source.get("kind") == "flight" for e in entries):
+        notes.append("A flight's truth is a place and a yaw: corner errors take its stated height for true, as `mace_m` does.")
     if quoted:
         data = paper()["data"]
         notes.append(
