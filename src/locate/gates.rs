@@ -88,12 +88,15 @@ pub fn judge_map(share: f64, settings: &GateSettings) -> Result<(), NoFix> {
     Err(NoFix::new(Reason::Nodata, detail))
 }
 
-/// `low_evidence`, then `ambiguous`: each bound applies where its number exists. Two peaks of similar weight share the
-/// posterior: for them its mass is that of both, so that they are told apart from a posterior without peaks.
-pub fn judge_evidence(evidence: &Evidence, settings: &GateSettings) -> Result<(), NoFix> {
+/// `low_evidence`, then `ambiguous`: each bound applies where its number exists. The mass is for bundles without a
+/// calibration, which weighs it with everything else: where the refine stage is sure, a coarse posterior of a third is
+/// enough. Two peaks of similar weight share the posterior: for them its mass is that of both, so that they are told apart
+/// from a posterior without peaks.
+pub fn judge_evidence(evidence: &Evidence, calibrated: bool, settings: &GateSettings) -> Result<(), NoFix> {
     let second = evidence.get("second_peak").copied().unwrap_or(0.0);
     let rivals = if second > settings.max_second_peak { second } else { 0.0 };
-    if let Some(mass) = evidence.get("peak_mass").filter(|mass| !(**mass * (1.0 + rivals) >= settings.min_peak_mass)) {
+    let enough = |mass: f64| calibrated || mass * (1.0 + rivals) >= settings.min_peak_mass;
+    if let Some(mass) = evidence.get("peak_mass").filter(|mass| !enough(**mass)) {
         let detail = format!("posterior mass round the peak: expected at least {}, found {mass:.3}", settings.min_peak_mass);
         return Err(NoFix::new(Reason::LowEvidence, detail));
     }
@@ -178,7 +181,7 @@ mod tests {
     fn evidence_is_judged_where_it_exists_and_low_comes_before_ambiguous() {
         let judge = |pairs: &[(&str, f64)]| {
             let evidence: Evidence = pairs.iter().map(|(name, value)| ((*name).into(), *value)).collect();
-            judge_evidence(&evidence, &settings()).map_err(|no_fix| no_fix.reason)
+            judge_evidence(&evidence, false, &settings()).map_err(|no_fix| no_fix.reason)
         };
         assert_eq!(judge(&[]), Ok(()));
         assert_eq!(

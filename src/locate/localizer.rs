@@ -190,7 +190,7 @@ impl Localizer {
         let judged = judge_quad(&found.quad, self.bundle.manifest.frame_width_m, search.yaw_known, &self.gates)
             .and_then(|()| judge_distance(position.distance_m(prior.position), prior.radius_m))
             .and_then(|()| judge_map(map_valid, &self.gates))
-            .and_then(|()| judge_evidence(&way.evidence, &self.gates))
+            .and_then(|()| judge_evidence(&way.evidence, integrity.is_some(), &self.gates))
             .and_then(|()| judge_probability(judgement.as_ref(), integrity.map_or(0.0, |table| table.bound_m), &self.gates));
         if let Err(no_fix) = judged {
             if self.gates.enabled {
