@@ -84,7 +84,9 @@ def test_the_table_counts_what_gates_let_through(tmp_path: Path) -> None:
     assert (found["desert"]["accepted"], found["desert"]["accepted > 25 m"]) == ("66.7 %", "1 of 2")
     assert (found["all"]["held back by"], found["mixed"]["median m"]) == ("low_evidence 1, flat_frame 1", "-")
     stored = tmp_path / "frames.json"
-    stored.write_text(json.dumps({"command": "made", "noise": "none", "frames": [f.__dict__ for f in frames]}))
+    stored.write_text(
+        json.dumps({"command": "made", "noise": "none", "bundle": "b (coarse 1)", "frames": [f.__dict__ for f in frames]})
+    )
     assert terrain.main(["--from", str(stored), "--report", str(tmp_path / "r" / "README.md")]) == 0
     assert "| desert | 3 | 40.00 |" in (tmp_path / "r" / "README.md").read_text()
 

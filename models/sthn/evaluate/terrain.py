@@ -20,6 +20,7 @@ import json
 import shlex
 import shutil
 import sys
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -122,11 +123,14 @@ def fly(
     if out.exists():
         shutil.rmtree(out)
     run([program, "simulate", "--map", seen, "--out", out, "--radius-m", "512", *words])
-    answers = []
     for gates in ("off", "on"):
-        fixes = out / f"replay-{gates}"
-        run([program, "replay", out, "--map", known, "--bundle", bundle, "--gates", gates, "--out", fixes])
-        answers.append([json.loads(line) for line in (fixes / "fixes.jsonl").open()])
+        run([program, "replay", out, "--map", known, "--bundle", bundle, "--gates", gates, "--out", out / f"replay-{gates}"])
+    return answered(out, terrain, classes)
+
+
+def answered(out: Path, terrain: str | None, classes: Path | None) -> list[Frame]:
+    """The frames of a flight that was answered both ways."""
+    answers = [[json.loads(line) for line in (out / f"replay-{g}" / "fixes.jsonl").open()] for g in ("off", "on")]
     with (out / "poses.csv").open() as file:
         poses = {row["file"]: row for row in csv.DictReader(file)}
     cover = LandCover(classes) if classes else None
@@ -179,14 +183,22 @@ def table(frames: list[Frame]) -> Table:
     return made
 
 
-def report(frames: list[Frame], command: str, noise: str) -> str:
+def identity(bundle: Path) -> str:
+    """A bundle's name and the first digits of its graphs' digests: a retrained one of the same name is another."""
+    manifest = tomllib.loads((bundle / "bundle.toml").read_text(encoding="utf-8"))
+    digests = [f"{stage} {manifest[stage]['graph']['sha256'][:8]}" for stage in ("coarse", "refine") if stage in manifest]
+    return f"{manifest['name']} ({', '.join(digests)})"
+
+
+def report(frames: list[Frame], command: str, noise: str, bundle: str) -> str:
     """The page: command, table, what the kinds are."""
     kinds = (__doc__ or "").split("\n\n")[2].replace("\n", " ")
     flights = ", ".join(f"`{name}`" for name in dict.fromkeys(f.flight for f in frames))
     body = table(frames).markdown().split("\n", 2)[2]
+    made_by = "Frames by `nightfix simulate` (its renderer has no part in training)"
     return (
-        f"# The shipped bundle by kind of ground\n\n`{command}`\n\nFrames by `nightfix simulate` (its renderer has no part in "
-        f"training), noise: {noise}; priors uniform in the disc of D_C = 512 m. Flights: {flights}.\n\n{kinds}\n\n{body}"
+        f"# The shipped bundle by kind of ground\n\n`{command}`\n\nBundle: {bundle}. {made_by}, noise: {noise}; priors uniform in "
+        f"the disc of D_C = 512 m. Flights: {flights}.\n\n{kinds}\n\n{body}"
     )
 
 
@@ -211,21 +223,22 @@ def main(arguments: list[str] | None = None) -> int:
         if o.stored:
             stored = json.loads(o.stored.read_text())
             frames = [Frame(**row) for row in stored["frames"]]
-            command, noise = stored["command"], stored["noise"]
+            command, noise, bundle = stored["command"], stored["noise"], stored["bundle"]
         else:
             command, noise = "python -m sthn.evaluate.terrain " + shlex.join(words), o.noise
-            frames = flights(o, command)
+            bundle = identity(o.bundle)
+            frames = flights(o, command, bundle)
     except (ValueError, OSError, KeyError, TypeError) as error:
         print(f"terrain: {error}", file=sys.stderr)
         return 2
     print(table(frames).markdown())
     if o.report:
         o.report.parent.mkdir(parents=True, exist_ok=True)
-        o.report.write_text(report(frames, command, noise))
+        o.report.write_text(report(frames, command, noise, bundle))
     return 0
 
 
-def flights(o: argparse.Namespace, command: str) -> list[Frame]:
+def flights(o: argparse.Namespace, command: str, bundle: str) -> list[Frame]:
     """All flights of the options; `frames.json` grows with each."""
     maps = [p for m in o.maps for p in (sorted(m.glob("*.tif")) if m.is_dir() else [m]) if not p.stem.endswith("_classes")]
     if missing := [p for m in maps if not (p := m.with_name(f"{m.stem}_classes.tif")).is_file()]:
@@ -242,7 +255,8 @@ def flights(o: argparse.Namespace, command: str) -> list[Frame]:
     frames: list[Frame] = []
     for seen, known, name, terrain, classes in tqdm(jobs, file=sys.stderr):
         frames += fly(o.nightfix, o.bundle, seen, known, o.out / name, words, terrain, classes)
-        stored = {"command": command, "noise": o.noise, "frames": [dataclasses.asdict(frame) for frame in frames]}
+        rows = [dataclasses.asdict(frame) for frame in frames]
+        stored = {"command": command, "noise": o.noise, "bundle": bundle, "frames": rows}
         (o.out / "frames.json").write_text(json.dumps(stored) + "\n")
     return frames
 
