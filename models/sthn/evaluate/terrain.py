@@ -197,8 +197,8 @@ def report(frames: list[Frame], command: str, noise: str, bundle: str) -> str:
     body = table(frames).markdown().split("\n", 2)[2]
     made_by = "Frames by `nightfix simulate` (its renderer has no part in training)"
     return (
-        f"# The shipped bundle by kind of ground\n\n`{command}`\n\nBundle: {bundle}. {made_by}, noise: {noise}; priors uniform in "
-        f"the disc of D_C = 512 m. Flights: {flights}.\n\n{kinds}\n\n{body}"
+        f"# The shipped bundle by kind of ground\n\n`{command}`\n\nBundle: {bundle}. {made_by}, noise: {noise}; priors uniform "
+        f"in the disc of D_C = 512 m. Flights: {flights}.\n\n{kinds}\n\n{body}"
     )
 
 
