@@ -4,7 +4,8 @@
 
 Frames by `nightfix simulate` (its renderer has no part in training), priors uniform in the disc of D_C = 512 m, yaw noise
 5 degrees, scale noise 5 %, seeds 1 to 3. Every frame counts whose footprint is under 60 % water. Two-stage and one-stage,
-with and without noise, each map apart and pooled. The table goes to `--table` (Markdown) and `--json`.
+with and without noise, each map apart and pooled. The table goes to `--table` (Markdown) and `--json`, the pooled row of the
+first noise to `--put`: the `[accuracy]` table of that bundle. `--radius-m` is D_C, for the smaller bundles of a ladder.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import json
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +24,7 @@ import pyproj
 from tqdm import tqdm
 
 from .. import correlate, geometry
+from .. import manifest as rules
 from ..bundle import GRAPHS, read_bundle, write_bundle
 
 WATER_SHARE = 0.6
@@ -118,6 +121,8 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=100, help="per map and seed")
     parser.add_argument("--noise", nargs="+", default=list(NOISES), choices=list(NOISES))
     parser.add_argument("--stages", nargs="+", default=["two", "one"], choices=["two", "one"])
+    parser.add_argument("--radius-m", type=float, default=512.0, help="D_C")
+    parser.add_argument("--put", action="store_true", help="write [accuracy] into the bundle")
     parser.add_argument("--table", type=Path)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
@@ -132,7 +137,7 @@ def main() -> None:
         flight = args.out / f"{path.stem}-{list(NOISES).index(noise)}-{seed}"
         if flight.exists():
             shutil.rmtree(flight)
-        words = ["simulate", "--map", path, "--out", flight, "--frames", args.frames, "--seed", seed, "--radius-m", 512]
+        words = ["simulate", "--map", path, "--out", flight, "--frames", args.frames, "--seed", seed, "--radius-m", args.radius_m]
         run([args.nightfix, *words, *NOISES[noise]])
         for stage in args.stages:
             fixes = flight / f"replay-{stage}"
@@ -148,8 +153,26 @@ def main() -> None:
     if args.table:
         words = " ".join(sys.argv[1:])
         args.table.write_text(f"# The bar\n\n`python -m sthn.lite.bar {words}`\n\n{__doc__.split(chr(10) * 2, 2)[2]}\n{text}\n")
+    if args.put:
+        row = next(r for r in results if (r["stages"], r["noise"], r["map"]) == ("two", args.noise[0], "pooled"))
+        put_accuracy(args.bundle, row, args.radius_m, [p.stem for p in maps])
     if args.json:
         args.json.write_text(json.dumps(results, indent=2) + "\n")
+
+
+def put_accuracy(bundle: Path, row: dict, radius_m: float, maps: list[str]) -> None:
+    """Replaces `[accuracy]` in `bundle.toml`, through the manifest's own rules."""
+    path = bundle / "bundle.toml"
+    manifest = tomllib.loads(path.read_text())
+    manifest["accuracy"] = {
+        "data": f"{', '.join(maps)}; {row['noise']}; priors uniform in the disc; gates off; under 60 % water",
+        "command": f"python -m sthn.lite.bar --bundle {bundle} --maps MAPS --radius-m {radius_m:g} --put",
+        "frames": row["counted"],
+        "search_radius_m": radius_m,
+        **{key: round(row[key], 4) for key in ("coverage", "median_m", "mean_m", "p95_m", "over_25m", "over_50m")},
+    }
+    rules.check(manifest)
+    path.write_text(rules.to_toml(rules.ordered(manifest)))
 
 
 def table(results: list[dict]) -> str:

@@ -268,7 +268,7 @@ def main() -> None:
     parser.add_argument("--name")
     parser.add_argument("--window-m", type=float, default=1536.0, help="W_S")
     parser.add_argument("--radius-m", type=float, default=512.0, help="D_C")
-    parser.add_argument("--scale-range", type=float, nargs=2, help="as measured by `sthn.evaluate.scales`")
+    parser.add_argument("--scale-range", type=float, nargs=2, help="as measured by `sthn.lite.scales`")
     parser.add_argument("--accuracy", type=Path, help="JSON of the [accuracy] table, from `sthn.lite.bar`")
     args = parser.parse_args()
     accuracy = json.loads(args.accuracy.read_text()) if args.accuracy else None
