@@ -20,6 +20,7 @@ from ..lite import coarse
 from ..lite.pairs import COARSE, Pairs
 from ..lite.scene import load_map
 from ..lite.train import CoarseTask
+from .checkpoint import TgmError
 from .frames import NightPairs
 from .rendered import Night
 
@@ -36,6 +37,17 @@ def peak_cells(surface: torch.Tensor) -> np.ndarray:
     share = torch.softmax(local.flatten(), 0).view(local.shape).numpy()
     y, x = np.mgrid[top : top + share.shape[0], left : left + share.shape[1]]
     return np.array([(share * x).sum(), (share * y).sum()])
+
+
+def last_weights(folder: Path) -> dict[str, torch.Tensor]:
+    """Of the last step, from `last.pt`: the running average in `weights.pt` is, in a short run, mostly the first ones.
+    Only where a long run kept no checkpoint, the average."""
+    last, average = folder / "last.pt", folder / "weights.pt"
+    if last.exists():
+        return torch.load(last, weights_only=True)["net"]
+    if average.exists():
+        return torch.load(average, weights_only=True)
+    raise TgmError(f"{folder}: expected last.pt or weights.pt of a coarse training, found neither")
 
 
 @torch.no_grad()
@@ -71,8 +83,7 @@ def main(words: list[str] | None = None) -> None:
     lines = ["| training | frames | pairs | median m | mean m | <= 25 m |", "|---|---|---|---|---|---|"]
     for folder in args.trained:
         net = CoarseTask().net
-        # Not `weights.pt`: the running average of a short run is mostly its first weights.
-        net.load_state_dict(torch.load(folder / "last.pt", weights_only=True)["net"])
+        net.load_state_dict(last_weights(folder))
         net.eval()
         for kind, pairs in kinds.items():
             e = errors_m(net, pairs, args.count)
