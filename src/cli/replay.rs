@@ -6,7 +6,7 @@ use crate::flight::{Flight, ReplayLine, ReplayReport, Thresholds, replay};
 use crate::locate::Localizer;
 use crate::map::{GeoTiff, MapCache};
 use crate::model::{Bundle, Provider, Runtime};
-use crate::track::Tracker;
+use crate::track::{Guard, Tracker};
 use std::io::{BufWriter, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
@@ -63,7 +63,8 @@ pub fn run(common: &Common, args: Args) -> Result<Outcome, UsageError> {
         tracing::warn!("{warning}");
     }
     let (mut localizer, tracker) = prepare(common, &args, &settings, &flight)?;
-    let report = fly(&flight, &mut localizer, tracker, args.out.as_deref())?;
+    let guard = Guard::new(settings.track.clone(), settings.gates.enabled);
+    let report = fly(&flight, &mut localizer, tracker, guard, args.out.as_deref())?;
     let text = serde_json::to_string_pretty(&report.metrics).map_err(|e| UsageError::from_error(&e))?;
     if let Some(folder) = &args.out {
         let path = folder.join("metrics.json");
@@ -106,7 +107,13 @@ fn prepare(common: &Common, args: &Args, settings: &Settings, flight: &Flight) -
 }
 
 /// Replays, writing the lines as they come.
-fn fly(flight: &Flight, localizer: &mut Localizer, tracker: Tracker, out: Option<&Path>) -> Result<ReplayReport, UsageError> {
+fn fly(
+    flight: &Flight,
+    localizer: &mut Localizer,
+    tracker: Tracker,
+    guard: Guard,
+    out: Option<&Path>,
+) -> Result<ReplayReport, UsageError> {
     let path = out.map(|folder| folder.join("fixes.jsonl"));
     let mut file = match (&path, out) {
         (Some(path), Some(folder)) => {
@@ -124,7 +131,7 @@ fn fly(flight: &Flight, localizer: &mut Localizer, tracker: Tracker, out: Option
         serde_json::to_writer(&mut *file, line)?;
         file.write_all(b"\n")
     };
-    let report = replay(flight, localizer, tracker, &mut write);
+    let report = replay(flight, localizer, tracker, guard, &mut write);
     if let Some(bar) = &bar {
         bar.finish_and_clear();
     }

@@ -10,7 +10,7 @@ use super::throttle::Throttle;
 use super::{DaemonError, Equipment, equip};
 use crate::bus::{self, BusError, Keys, State};
 use crate::config::Settings;
-use crate::track::Tracker;
+use crate::track::{Guard, Tracker};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -151,6 +151,7 @@ async fn serve(
         provider: provider.name().to_owned(),
     };
     let tracker = Tracker::new(settings.track.clone()).with_search_radius_m(manifest.search_radius_m);
+    let guard = Guard::new(settings.track.clone(), settings.gates.enabled);
     let health = Arc::new(Health::new(identity, deadline));
     let inbox = Arc::new(Inbox::new(tracker, Attitudes::new(settings.daemon.max_attitude_age_s)));
     let outbox = Arc::new(Outbox::new(&health));
@@ -173,7 +174,7 @@ async fn serve(
     let mut inference = {
         let (inbox, outbox, health, camera) = (inbox.clone(), outbox.clone(), health.clone(), settings.camera);
         Worker::start("inference", move || {
-            answer_frames(&inbox, &outbox, &health, &camera, deadline, |query| localizer.locate(query));
+            answer_frames(&inbox, &outbox, &health, &camera, deadline, guard, |query| localizer.locate(query));
         })?
     };
     let mut publishing = {
