@@ -63,6 +63,10 @@ impl Settings {
         whole("track.steady_reports", track.steady_reports.into(), 1, 100)?;
         whole("track.frozen_frames", track.frozen_frames.into(), 2, 1_000_000)?;
         at_most("track.frozen_after_s", track.frozen_after_s, 3600.0)?;
+        whole("track.track_lag_fixes", track.track_lag_fixes.into(), 1, 1000)?;
+        positive("track.track_accel_mps2", track.track_accel_mps2, 1000.0)?;
+        positive("track.track_gate", track.track_gate, 1e6)?;
+        whole("track.track_restart_after", track.track_restart_after.into(), 1, 1000)?;
 
         let gates = &self.gates;
         between("gates.min_map_valid", gates.min_map_valid, 0.0, 1.0)?;

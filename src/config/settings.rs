@@ -101,6 +101,16 @@ pub struct TrackSettings {
     pub frozen_frames: u32,
     /// where the first and the last are at least this far apart, seconds: some streams repeat a slow camera's pictures.
     pub frozen_after_s: f64,
+    /// Whether the smoothed track is published beside the fixes.
+    pub publish_track: bool,
+    /// The smoother's lag, fixes.
+    pub track_lag_fixes: u32,
+    /// White acceleration of the track's motion, 1-sigma, metres per second squared.
+    pub track_accel_mps2: f64,
+    /// Largest squared normalised innovation of a fix that goes into the track.
+    pub track_gate: f64,
+    /// Fixes left out in a row after which the track begins anew.
+    pub track_restart_after: u32,
 }
 
 /// Gates. `enabled = false` (replay `--gates off`) leaves only what has no answer: reasons up to `non_finite`.
