@@ -27,6 +27,7 @@ fn fix(stamp_ns: i64, seq: u64, at: Enu, sigma_m: f64) -> FixMessage {
     };
     let answer = Answer {
         outcome: Ok(fix),
+        withheld: None,
         prior: None,
         searched: false,
         window: None,
