@@ -27,5 +27,6 @@ pub mod homography;
 pub mod locate;
 pub mod map;
 pub mod model;
+pub mod survey;
 pub mod thermal;
 pub mod track;

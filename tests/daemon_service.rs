@@ -33,6 +33,15 @@ fn frame_file(tiny: &Tiny) -> PathBuf {
     tiny.folder.join("frame.png")
 }
 
+/// The frame with one pixel changed: a live camera never gives the same picture twice.
+fn picture(tiny: &Tiny, number: u8) -> PathBuf {
+    let mut image = image::open(frame_file(tiny)).unwrap();
+    let path = tiny.folder.join(format!("frame-{number}.png"));
+    image::GenericImage::put_pixel(&mut image, 0, 0, image::Rgba([number, number, number, 255]));
+    image.save(&path).unwrap();
+    path
+}
+
 /// Ends it as systemd does.
 fn stop(mut service: Service, manager: &Manager) {
     service.signal("TERM");
@@ -85,7 +94,7 @@ fn a_flight_of_the_service_from_start_to_stop() {
     let answer = peer.answer(T0);
     assert_eq!((&answer["status"], &answer["reason"], &answer["seq"]), (&json!("no_fix"), &json!("no_prior"), &json!(1)));
     peer.put("prior", prior(tiny, T0 + S));
-    peer.frame(attachment(T0 + S), &frame_file(tiny));
+    peer.frame(attachment(T0 + S), &picture(tiny, 1));
     let answer = peer.answer(T0 + S);
     check_fix(&answer, tiny);
     assert_eq!((&answer["prior"]["source"], &answer["prior"]["chain"]), (&json!("external"), &json!(0)));
@@ -97,7 +106,7 @@ fn a_flight_of_the_service_from_start_to_stop() {
     assert_eq!(reply, answer);
 
     // The next frame's prior is our own fix; its echo is known as such; the status says all of it.
-    peer.frame(attachment(T0 + 2 * S), &frame_file(tiny));
+    peer.frame(attachment(T0 + 2 * S), &picture(tiny, 2));
     let own = peer.answer(T0 + 2 * S);
     assert_eq!(
         (&own["prior"]["source"], &own["prior"]["chain"], &own["prior"]["sigma_m"]),
@@ -106,7 +115,7 @@ fn a_flight_of_the_service_from_start_to_stop() {
     let mut echo = prior(tiny, T0 + 3 * S);
     echo["fix_seq"] = own["seq"].clone();
     peer.put("prior", echo);
-    peer.frame(attachment(T0 + 3 * S), &frame_file(tiny));
+    peer.frame(attachment(T0 + 3 * S), &picture(tiny, 3));
     let echoed = peer.answer(T0 + 3 * S);
     assert_eq!((&echoed["prior"]["source"], &echoed["prior"]["chain"]), (&json!("own_fix"), &json!(3)));
     let status = peer.status("three fixes", |status| status["fixes"] == 3);

@@ -23,6 +23,10 @@ impl Keys {
     pub fn alive(&self) -> String {
         format!("{}/alive", self.root)
     }
+    /// Out, where it is asked for: the smoothed track.
+    pub fn track(&self) -> String {
+        format!("{}/track", self.root)
+    }
     /// In: frames.
     pub fn frame(&self) -> String {
         format!("{}/frame", self.root)

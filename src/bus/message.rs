@@ -98,6 +98,43 @@ pub struct LastFixMessage {
     pub age_ms: u64,
 }
 
+/// One state of the optional track: published fixes, filtered. Beside the raw fixes, never instead of them.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct TrackMessage {
+    /// Exposure of the fix that led to it, Unix UTC nanoseconds.
+    pub stamp_ns: i64,
+    /// Message number of that fix.
+    pub fix_seq: u64,
+    /// Latitude of the vehicle, WGS84 degrees.
+    pub lat_deg: f64,
+    /// Longitude of the vehicle, WGS84 degrees.
+    pub lon_deg: f64,
+    /// East-north covariance, square metres; never below what neighbouring fixes have in common.
+    pub covariance_enu_m2: [[f64; 2]; 2],
+    /// East and north, metres per second.
+    pub velocity_enu_mps: [f64; 2],
+    /// Squared innovation of the fix in units of its covariance, 2 degrees of freedom; absent where the track begins.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub innovation_nees: Option<f64>,
+    /// What is known now of an earlier fix's place.
+    pub lagged: LaggedState,
+}
+
+/// An earlier place on the track, in the light of the fixes since.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct LaggedState {
+    /// Exposure, Unix UTC nanoseconds.
+    pub stamp_ns: i64,
+    /// Message number of the fix then.
+    pub fix_seq: u64,
+    /// Latitude of the vehicle, WGS84 degrees.
+    pub lat_deg: f64,
+    /// Longitude of the vehicle, WGS84 degrees.
+    pub lon_deg: f64,
+    /// East-north covariance, square metres.
+    pub covariance_enu_m2: [[f64; 2]; 2],
+}
+
 /// The searched window.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct WindowMessage {

@@ -1,10 +1,10 @@
 //! The JSON schemas of the messages, generated from the Rust types. `schemas/` holds them, checked by a test.
 
-use super::{AttitudeMessage, FixMessage, FrameAttachment, PriorMessage, StatusMessage};
+use super::{AttitudeMessage, FixMessage, FrameAttachment, PriorMessage, StatusMessage, TrackMessage};
 use schemars::{JsonSchema, generate::SchemaSettings};
 
 /// Names of the messages, and of the files in `schemas/`.
-pub const SCHEMA_NAMES: [&str; 5] = ["attitude", "fix", "frame", "prior", "status"];
+pub const SCHEMA_NAMES: [&str; 6] = ["attitude", "fix", "frame", "prior", "status", "track"];
 
 /// The schema of a message, as the text of its file; `None` where there is no such message.
 pub fn schema(name: &str) -> Option<String> {
@@ -14,6 +14,7 @@ pub fn schema(name: &str) -> Option<String> {
         "frame" => Some(text::<FrameAttachment>(true)),
         "prior" => Some(text::<PriorMessage>(true)),
         "status" => Some(text::<StatusMessage>(false)),
+        "track" => Some(text::<TrackMessage>(false)),
         _ => None,
     }
 }

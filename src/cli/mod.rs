@@ -9,6 +9,7 @@ mod replay;
 mod run;
 mod schema;
 mod simulate;
+mod survey;
 
 use clap::{Parser, Subcommand};
 use std::io::IsTerminal;
@@ -38,6 +39,8 @@ enum Command {
     Replay(replay::Args),
     /// Render a recorded flight over a map, or over a procedural world.
     Simulate(simulate::Args),
+    /// Before the flight: where on this map will fixes work?
+    Survey(survey::Args),
     /// Show what the network sees of a frame: decoded, tone-mapped, rectified.
     Frame(frame::Args),
     /// Print the JSON schemas of the messages.
@@ -100,6 +103,7 @@ pub fn main() -> ExitCode {
         Command::Locate(args) => locate::run(&common, args),
         Command::Replay(args) => replay::run(&common, args),
         Command::Simulate(args) => simulate::run(&common, args),
+        Command::Survey(args) => survey::run(&common, args),
         Command::Frame(args) => frame::run(&common, args),
         Command::Schema(args) => schema::run(&common, args),
     };

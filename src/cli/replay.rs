@@ -6,7 +6,7 @@ use crate::flight::{Flight, ReplayLine, ReplayReport, Thresholds, replay};
 use crate::locate::Localizer;
 use crate::map::{GeoTiff, MapCache};
 use crate::model::{Bundle, Provider, Runtime};
-use crate::track::Tracker;
+use crate::track::{Guard, TrackFilter, Tracker};
 use std::io::{BufWriter, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
@@ -30,7 +30,8 @@ pub struct Args {
     /// The bundle's folder; else the configuration's.
     #[arg(long, value_name = "DIR")]
     bundle: Option<PathBuf>,
-    /// Where `fixes.jsonl` and `metrics.json` go (made if absent). The metrics are printed in any case.
+    /// Where `fixes.jsonl` and `metrics.json` go (made if absent), and `track.jsonl` where the configuration asks for the
+    /// track. The metrics are printed in any case.
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Configuration: bundle, provider, gates, tracking and error budget.
@@ -63,7 +64,9 @@ pub fn run(common: &Common, args: Args) -> Result<Outcome, UsageError> {
         tracing::warn!("{warning}");
     }
     let (mut localizer, tracker) = prepare(common, &args, &settings, &flight)?;
-    let report = fly(&flight, &mut localizer, tracker, args.out.as_deref())?;
+    let guard = Guard::new(settings.track.clone(), settings.gates.enabled);
+    let filter = settings.track.publish_track.then(|| TrackFilter::new(settings.track.clone()));
+    let report = fly(&flight, &mut localizer, tracker, guard, filter, args.out.as_deref())?;
     let text = serde_json::to_string_pretty(&report.metrics).map_err(|e| UsageError::from_error(&e))?;
     if let Some(folder) = &args.out {
         let path = folder.join("metrics.json");
@@ -106,29 +109,42 @@ fn prepare(common: &Common, args: &Args, settings: &Settings, flight: &Flight) -
 }
 
 /// Replays, writing the lines as they come.
-fn fly(flight: &Flight, localizer: &mut Localizer, tracker: Tracker, out: Option<&Path>) -> Result<ReplayReport, UsageError> {
+fn fly(
+    flight: &Flight,
+    localizer: &mut Localizer,
+    tracker: Tracker,
+    guard: Guard,
+    mut filter: Option<TrackFilter>,
+    out: Option<&Path>,
+) -> Result<ReplayReport, UsageError> {
     let path = out.map(|folder| folder.join("fixes.jsonl"));
-    let mut file = match (&path, out) {
-        (Some(path), Some(folder)) => {
-            std::fs::create_dir_all(folder).map_err(|e| file_error(folder, &e))?;
-            Some(BufWriter::new(std::fs::File::create(path).map_err(|e| file_error(path, &e))?))
-        }
-        _ => None,
+    let track_path = out.filter(|_| filter.is_some()).map(|folder| folder.join("track.jsonl"));
+    if let Some(folder) = out {
+        std::fs::create_dir_all(folder).map_err(|e| file_error(folder, &e))?;
+    }
+    let create = |path: &Option<PathBuf>| {
+        let file = path.as_ref().map(|path| std::fs::File::create(path).map_err(|e| file_error(path, &e)));
+        file.transpose().map(|file| file.map(BufWriter::new))
     };
+    let (mut file, mut track) = (create(&path)?, create(&track_path)?);
     let bar = std::io::stderr().is_terminal().then(|| indicatif::ProgressBar::new(flight.rows.len() as u64));
     let mut write = |line: &ReplayLine| -> std::io::Result<()> {
         if let Some(bar) = &bar {
             bar.inc(1);
         }
+        if let (Some(track), Some(state)) = (&mut track, filter.as_mut().and_then(|filter| filter.take(&line.message))) {
+            serde_json::to_writer(&mut *track, &state)?;
+            track.write_all(b"\n")?;
+        }
         let Some(file) = &mut file else { return Ok(()) };
         serde_json::to_writer(&mut *file, line)?;
         file.write_all(b"\n")
     };
-    let report = replay(flight, localizer, tracker, &mut write);
+    let report = replay(flight, localizer, tracker, guard, &mut write);
     if let Some(bar) = &bar {
         bar.finish_and_clear();
     }
-    let flushed = file.as_mut().map_or(Ok(()), Write::flush);
+    let flushed = [&mut file, &mut track].into_iter().flatten().try_for_each(Write::flush);
     let target = path.unwrap_or_default();
     let report = report.map_err(|e| file_error(&target, &e))?;
     flushed.map_err(|e| file_error(&target, &e))?;

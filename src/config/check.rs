@@ -54,6 +54,19 @@ impl Settings {
         whole("track.fall_back_after_no_fix", track.fall_back_after_no_fix.into(), 1, 1_000_000)?;
         positive("track.fall_back_after_s", track.fall_back_after_s, 86_400.0)?;
         positive("track.max_prior_age_s", track.max_prior_age_s, 86_400.0)?;
+        at_most("track.jump_slack_m", track.jump_slack_m, 100_000.0)?;
+        whole("track.confirmations", track.confirmations.into(), 1, 8)?;
+        at_most("track.confirm_distance_m", track.confirm_distance_m, 100_000.0)?;
+        at_most("track.confirm_after_s", track.confirm_after_s, 3600.0)?;
+        positive("track.confirm_within_s", track.confirm_within_s, 3600.0)?;
+        between("track.max_agreement_share", track.max_agreement_share, 0.0, 1.0)?;
+        whole("track.steady_reports", track.steady_reports.into(), 1, 100)?;
+        whole("track.frozen_frames", track.frozen_frames.into(), 2, 1_000_000)?;
+        at_most("track.frozen_after_s", track.frozen_after_s, 3600.0)?;
+        whole("track.track_lag_fixes", track.track_lag_fixes.into(), 1, 1000)?;
+        positive("track.track_accel_mps2", track.track_accel_mps2, 1000.0)?;
+        positive("track.track_gate", track.track_gate, 1e6)?;
+        whole("track.track_restart_after", track.track_restart_after.into(), 1, 1000)?;
 
         let gates = &self.gates;
         between("gates.min_map_valid", gates.min_map_valid, 0.0, 1.0)?;

@@ -82,6 +82,35 @@ pub struct TrackSettings {
     pub fall_back_after_s: f64,
     /// Age beyond which an external prior is stale, seconds.
     pub max_prior_age_s: f64,
+    /// What two fixes may lie apart beyond motion and 3 sigma of both, metres (`held_back`).
+    pub jump_slack_m: f64,
+    /// Earlier answers that must agree with one that is held back.
+    pub confirmations: u32,
+    /// Answers this far apart are of other ground, metres.
+    pub confirm_distance_m: f64,
+    /// Answers this much apart in time are of other ground, seconds.
+    pub confirm_after_s: f64,
+    /// Answers further apart in time do not confirm each other, seconds.
+    pub confirm_within_s: f64,
+    /// Largest ratio of what counts as agreement (a radius) to the radius of a search.
+    pub max_agreement_share: f64,
+    /// Steps between external priors, all such as the vehicle can fly, after which their source is taken as continuous: then
+    /// it explains no jump of a fix.
+    pub steady_reports: u32,
+    /// The same picture so many times in a row is `held_back`,
+    pub frozen_frames: u32,
+    /// where the first and the last are at least this far apart, seconds: some streams repeat a slow camera's pictures.
+    pub frozen_after_s: f64,
+    /// Whether the smoothed track is published beside the fixes.
+    pub publish_track: bool,
+    /// The smoother's lag, fixes.
+    pub track_lag_fixes: u32,
+    /// White acceleration of the track's motion, 1-sigma, metres per second squared.
+    pub track_accel_mps2: f64,
+    /// Largest squared normalised innovation of a fix that goes into the track.
+    pub track_gate: f64,
+    /// Fixes left out in a row after which the track begins anew.
+    pub track_restart_after: u32,
 }
 
 /// Gates. `enabled = false` (replay `--gates off`) leaves only what has no answer: reasons up to `non_finite`.

@@ -8,7 +8,7 @@ use super::throttle::lock;
 use crate::bus::FixMessage;
 use crate::locate::{Answer, EncodedFrame, NoFix, Query, Reason};
 use crate::thermal::{CameraModel, Encoding, FrameError, Pose};
-use crate::track::Tracker;
+use crate::track::{Guard, Tracker};
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
@@ -57,13 +57,15 @@ impl Inbox {
     }
 }
 
-/// Answers frames until the slot is closed and empty. `locate` is [`crate::locate::Localizer::locate`].
+/// Answers frames until the slot is closed and empty. `locate` is [`crate::locate::Localizer::locate`]; what it finds goes
+/// past the `guard` before anything else learns of it.
 pub fn answer_frames(
     inbox: &Inbox,
     outbox: &Outbox,
     health: &Health,
     camera: &CameraModel,
     deadline: Duration,
+    mut guard: Guard,
     mut locate: impl FnMut(&Query<'_>) -> Answer,
 ) {
     let identity = health.identity().clone();
@@ -77,7 +79,8 @@ pub fn answer_frames(
             Popped::Closed => return,
         };
         health.begin(job.arrived);
-        let answer = answer(inbox, &job, camera, deadline, &mut locate);
+        let mut answer = answer(inbox, &job, camera, deadline, &mut locate);
+        guard.judge(job.stamp_ns, job.frame.as_ref().ok().map(|frame| frame.bytes.as_slice()), &mut answer);
         lock(&inbox.tracker).record(job.stamp_ns, seq, &answer);
         let reason = answer.outcome.as_ref().err().map(|no_fix| no_fix.reason);
         outbox.push(FixMessage::new(job.stamp_ns, seq, &answer, &identity.bundle, &identity.map), health);

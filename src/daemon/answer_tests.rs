@@ -6,7 +6,7 @@ use crate::config::Settings;
 use crate::daemon::health::Identity;
 use crate::geo::LatLon;
 use crate::locate::{Fix, PriorSource, StageName};
-use crate::track::{PriorReport, Spread};
+use crate::track::{Guard, PriorReport, Spread};
 use std::collections::BTreeMap;
 
 const S: i64 = 1_000_000_000;
@@ -75,7 +75,8 @@ impl Bench {
         let camera = CameraModel::default();
         let mut messages = Vec::new();
         std::thread::scope(|scope| {
-            scope.spawn(|| answer_frames(&self.inbox, &self.outbox, &self.health, &camera, deadline, locate));
+            let guard = Guard::new(Settings::defaults().unwrap().track, true);
+            scope.spawn(|| answer_frames(&self.inbox, &self.outbox, &self.health, &camera, deadline, guard, locate));
             for job in jobs {
                 let seq = self.outbox.last().message.seq;
                 assert!(self.inbox.frames.push(job).is_none());
@@ -173,4 +174,65 @@ fn the_pose_comes_from_the_frame_then_from_the_attitude() {
     assert_eq!((seen[0].yaw_deg, seen[0].hfov_deg, seen[0].agl_m), (Some(5.0), Some(40.0), Some(400.0)));
     assert!((seen[0].pitch_deg.unwrap() - 2.0).abs() < 1e-9);
     assert_eq!(seen[1], Pose::default(), "too old is unknown");
+}
+
+/// Through two real messages: what we publish, and what an estimator makes of it.
+#[test]
+fn the_echo_of_our_own_fix_is_known_and_its_depth_is_said() {
+    let bench = bench(LONG);
+    lock(&bench.inbox.tracker).report(prior(S));
+    let picture = |i: i64| {
+        let frame = FrameBytes { bytes: vec![i as u8], encoding: Encoding::Png, size_px: (640, 512) };
+        Job { frame: Ok(frame), ..job(i * S) }
+    };
+    let echo_of_last = |stamp_ns: i64, honest: bool| {
+        let fix = serde_json::to_value(bench.outbox.last().message).unwrap();
+        let mut prior = serde_json::json!({
+            "stamp_ns": stamp_ns, "lat_deg": fix["lat_deg"], "lon_deg": fix["lon_deg"], "sigma_m": 2.0,
+        });
+        if honest {
+            prior["fix_seq"] = fix["seq"].clone();
+        }
+        let message = crate::bus::PriorMessage::parse(&serde_json::to_vec(&prior).unwrap()).unwrap();
+        assert!(lock(&bench.inbox.tracker).report(message.report().unwrap()));
+    };
+    let jobs = (1..=4).map(|i| {
+        if i > 1 {
+            echo_of_last(i * S, i < 4);
+        }
+        picture(i)
+    });
+    let messages: Vec<_> = bench.answer(jobs, LONG, locate).iter().map(|m| serde_json::to_value(m).unwrap()).collect();
+    let prior = |i: usize| (messages[i]["prior"]["source"].clone(), messages[i]["prior"]["chain"].clone());
+    assert!(messages.iter().all(|message| message["status"] == "fix"), "{messages:#?}");
+    assert_eq!(prior(0), ("external".into(), 0.into()));
+    // A fix from an external prior, echoed: its echo is two deep, and so on.
+    assert_eq!(prior(1), ("own_fix".into(), 2.into()));
+    assert_eq!(messages[1]["prior"]["sigma_m"], 50.0, "however sure the estimator is of what we told it");
+    assert_eq!(prior(2), ("own_fix".into(), 4.into()));
+    // Without `fix_seq` an echo cannot be told from a prior of its own right.
+    assert_eq!(prior(3), ("external".into(), 0.into()));
+}
+
+#[test]
+fn what_the_guard_holds_back_is_said_and_becomes_no_prior() {
+    let bench = bench(LONG);
+    lock(&bench.inbox.tracker).report(prior(S));
+    let picture = |i: i64| {
+        let frame = FrameBytes { bytes: vec![i as u8], encoding: Encoding::Png, size_px: (640, 512) };
+        Job { frame: Ok(frame), ..job(S + i * S / 10) }
+    };
+    let mut count = 0;
+    let messages = bench.answer((0..3).map(picture), LONG, |query| {
+        let mut answer = locate(query);
+        count += 1;
+        if let (2, Ok(fix)) = (count, &mut answer.outcome) {
+            fix.position = fix.position.offset(crate::geo::Enu { east_m: 140.0, north_m: 0.0 });
+        }
+        answer
+    });
+    assert_eq!(messages.iter().map(|m| m.reason).collect::<Vec<_>>(), [None, Some(Reason::HeldBack), None]);
+    assert!(messages[1].lat_deg.is_none() && messages[1].detail.as_deref().unwrap().contains("found 140.0 m"));
+    assert_eq!((messages[2].prior.unwrap().chain, messages[2].prior.unwrap().lon_deg), (1, 55.0));
+    assert_eq!(bench.health.status().no_fix[&Reason::HeldBack], 1);
 }

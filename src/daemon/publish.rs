@@ -58,8 +58,14 @@ impl Outbox {
     }
 }
 
-/// Sends answers until the outbox is closed and empty. `put` is the Zenoh publisher's, and may block.
-pub fn publish_answers(outbox: &Outbox, health: &Health, put: impl Fn(Vec<u8>) -> Result<(), String>) {
+/// Sends answers until the outbox is closed and empty. `put` is the Zenoh publisher's, and may block; `after` is told of each
+/// answer then.
+pub fn publish_answers(
+    outbox: &Outbox,
+    health: &Health,
+    put: impl Fn(Vec<u8>) -> Result<(), String>,
+    mut after: impl FnMut(&FixMessage),
+) {
     let throttle = Throttle::default();
     loop {
         health.beat(&health.publishing);
@@ -75,6 +81,7 @@ pub fn publish_answers(outbox: &Outbox, health: &Health, put: impl Fn(Vec<u8>) -
                 tracing::warn!(seq = message.seq, silent, "an answer could not be published: {why}");
             }
         }
+        after(&message);
     }
 }
 
@@ -111,12 +118,17 @@ mod tests {
         let sent = Mutex::new(Vec::new());
         std::thread::scope(|scope| {
             scope.spawn(|| {
-                publish_answers(&outbox, &health, |bytes| {
-                    let _ = enter.send(());
-                    let _ = lock(&left).recv();
-                    lock(&sent).push(serde_json::from_slice::<FixMessage>(&bytes).unwrap().seq);
-                    Ok(())
-                })
+                publish_answers(
+                    &outbox,
+                    &health,
+                    |bytes| {
+                        let _ = enter.send(());
+                        let _ = lock(&left).recv();
+                        lock(&sent).push(serde_json::from_slice::<FixMessage>(&bytes).unwrap().seq);
+                        Ok(())
+                    },
+                    |_| (),
+                )
             });
             let message = outbox.last().message;
             outbox.push(FixMessage { seq: 0, ..message.clone() }, &health);
@@ -141,7 +153,7 @@ mod tests {
         assert_eq!(message.status, Status::NoFix);
         outbox.push(message, &health);
         outbox.close();
-        publish_answers(&outbox, &health, |_| Err("no".to_owned()));
+        publish_answers(&outbox, &health, |_| Err("no".to_owned()), |_| ());
         assert_eq!(health.status().answers_unpublished, 1);
     }
 }

@@ -8,9 +8,9 @@ use super::publish::{Outbox, publish_answers};
 use super::systemd::{Manager, watchdog_period};
 use super::throttle::Throttle;
 use super::{DaemonError, Equipment, equip};
-use crate::bus::{self, BusError, Keys, State};
+use crate::bus::{self, BusError, FixMessage, Keys, State};
 use crate::config::Settings;
-use crate::track::Tracker;
+use crate::track::{Guard, TrackFilter, Tracker};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -151,6 +151,7 @@ async fn serve(
         provider: provider.name().to_owned(),
     };
     let tracker = Tracker::new(settings.track.clone()).with_search_radius_m(manifest.search_radius_m);
+    let guard = Guard::new(settings.track.clone(), settings.gates.enabled);
     let health = Arc::new(Health::new(identity, deadline));
     let inbox = Arc::new(Inbox::new(tracker, Attitudes::new(settings.daemon.max_attitude_age_s)));
     let outbox = Arc::new(Outbox::new(&health));
@@ -170,16 +171,33 @@ async fn serve(
         .await
         .map_err(declaring("the publisher of `status`"))?;
 
+    let track = match settings.track.publish_track {
+        false => None,
+        true => {
+            let track = session.declare_publisher(keys.track()).encoding(Encoding::APPLICATION_JSON);
+            let track = track.congestion_control(CongestionControl::Drop).await;
+            Some((track.map_err(declaring("the publisher of `track`"))?, TrackFilter::new(settings.track.clone())))
+        }
+    };
+
     let mut inference = {
         let (inbox, outbox, health, camera) = (inbox.clone(), outbox.clone(), health.clone(), settings.camera);
         Worker::start("inference", move || {
-            answer_frames(&inbox, &outbox, &health, &camera, deadline, |query| localizer.locate(query));
+            answer_frames(&inbox, &outbox, &health, &camera, deadline, guard, |query| localizer.locate(query));
         })?
     };
     let mut publishing = {
         let (outbox, health) = (outbox.clone(), health.clone());
         Worker::start("publishing", move || {
-            publish_answers(&outbox, &health, |bytes| fix.put(bytes).wait().map_err(|e| e.to_string()));
+            let mut track = track;
+            let follow = |message: &FixMessage| {
+                let Some((publisher, filter)) = &mut track else { return };
+                let Some(bytes) = filter.take(message).and_then(|state| serde_json::to_vec(&state).ok()) else { return };
+                if let Err(error) = publisher.put(bytes).wait() {
+                    tracing::debug!("the track could not be published: {error}");
+                }
+            };
+            publish_answers(&outbox, &health, |bytes| fix.put(bytes).wait().map_err(|e| e.to_string()), follow);
         })?
     };
 

@@ -6,13 +6,14 @@
 
 mod classes;
 mod format;
+pub(crate) mod ground;
 mod metrics;
 pub mod night;
 pub mod noise;
 mod replay;
 pub mod sensor;
 mod simulate;
-mod trajectory;
+pub(crate) mod trajectory;
 pub mod world;
 
 pub use format::{Flight, FlightError, Row, RowPrior};

@@ -7,7 +7,7 @@ use super::metrics::{Metrics, Tally};
 use crate::bus::{FixMessage, MapId};
 use crate::locate::{Answer, EncodedFrame, Localizer, NoFix, Prior, PriorSource, Query, Reason};
 use crate::thermal::{FrameError, decode};
-use crate::track::{PriorReport, Spread, Tracker};
+use crate::track::{Guard, PriorReport, Spread, Tracker};
 use serde::Serialize;
 
 /// One line of `fixes.jsonl`: the message, and what only a replay knows.
@@ -54,6 +54,7 @@ pub fn replay<E>(
     flight: &Flight,
     localizer: &mut impl Locate,
     mut tracker: Tracker,
+    mut guard: Guard,
     mut line: impl FnMut(&ReplayLine) -> Result<(), E>,
 ) -> Result<ReplayReport, E> {
     let (bundle, map) = localizer.identity();
@@ -69,7 +70,8 @@ pub fn replay<E>(
             pose: flight.camera.camera_pose(&crate::thermal::Pose { hfov_deg: flight.camera.hfov_deg, ..row.pose }),
             prior: prior(row, &mut tracker),
         };
-        let answer = localizer.locate(&query);
+        let mut answer = localizer.locate(&query);
+        guard.judge(row.stamp_ns, query.frame.as_ref().ok().map(|frame| frame.bytes), &mut answer);
         tracker.record(row.stamp_ns, seq, &answer);
         unreadable += usize::from(is_unreadable(&query.frame, &answer));
         let message = FixMessage::new(row.stamp_ns, seq, &answer, &bundle, &map);

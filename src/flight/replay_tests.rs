@@ -47,21 +47,25 @@ impl Locate for Echo {
     }
 }
 
-/// A flight with these rows; `good.png` is a frame, `torn.png` is none, others are absent.
+/// A flight with these rows; `good.png` and `good2.png` to `good5.png` are frames, `torn.png` is none, others are absent.
 fn flight(folder: &Path, rows: &str) -> Flight {
     let header =
         "file,stamp_ns,gsd_m,yaw_deg,prior_lat_deg,prior_lon_deg,prior_sigma_m,prior_radius_m,truth_lat_deg,truth_lon_deg";
     std::fs::write(folder.join("flight.toml"), "").expect("flight.toml");
     std::fs::write(folder.join("poses.csv"), format!("{header}\n{rows}")).expect("poses.csv");
-    image::GrayImage::from_fn(8, 8, |x, y| image::Luma([(x * 31 + y * 7) as u8])).save(folder.join("good.png")).expect("a frame");
+    for (i, name) in (0..).zip(["good.png", "good2.png", "good3.png", "good4.png", "good5.png"]) {
+        let picture = image::GrayImage::from_fn(8, 8, |x, y| image::Luma([(x * 31 + y * 7 + i) as u8]));
+        picture.save(folder.join(name)).expect("a frame");
+    }
     std::fs::write(folder.join("torn.png"), b"\x89PNG\r\n\x1a\nno more").expect("a torn frame");
     Flight::open(folder).expect("a flight")
 }
 
 fn run(flight: &Flight) -> (Vec<serde_json::Value>, ReplayReport) {
-    let tracker = Tracker::new(Settings::defaults().expect("defaults").track);
+    let settings = Settings::defaults().expect("defaults").track;
+    let (tracker, guard) = (Tracker::new(settings.clone()), Guard::new(settings, true));
     let mut lines = Vec::new();
-    let report = replay(flight, &mut Echo, tracker, |line| {
+    let report = replay(flight, &mut Echo, tracker, guard, |line| {
         lines.push(serde_json::to_value(line)?);
         Ok::<_, serde_json::Error>(())
     });
@@ -105,10 +109,10 @@ fn no_line_says_where_the_flight_lies() {
 fn a_row_s_own_prior_first_then_the_last_fix() {
     let folder = tempfile::tempdir().expect("a folder");
     let rows = "good.png,1000000000,1,0,,,,,,\n\
-                good.png,2000000000,1,0,25.2,55.3,,500,,\n\
-                good.png,3000000000,1,0,,,,,,\n\
-                good.png,4000000000,1,0,25.2,55.3,40,,,\n\
-                good.png,5000000000,1,0,25.2,55.3,,,,\n";
+                good2.png,2000000000,1,0,25.2,55.3,,500,,\n\
+                good3.png,3000000000,1,0,,,,,,\n\
+                good4.png,4000000000,1,0,25.2,55.3,40,,,\n\
+                good5.png,5000000000,1,0,25.2,55.3,,,,\n";
     let (lines, _) = run(&flight(folder.path(), rows));
     let [none, own_row, chained, sigma, widthless] = lines.as_slice() else { panic!("five lines") };
     assert_eq!(none["reason"], "no_prior");
@@ -140,11 +144,37 @@ fn two_runs_give_the_same_lines() {
 fn an_error_of_the_writer_ends_the_replay() {
     let folder = tempfile::tempdir().expect("a folder");
     let flight = flight(folder.path(), "good.png,10,1,0,25.2,55.3,,500,,\ngood.png,20,1,0,,,,,,\n");
-    let tracker = Tracker::new(Settings::defaults().expect("defaults").track);
+    let settings = Settings::defaults().expect("defaults").track;
+    let (tracker, guard) = (Tracker::new(settings.clone()), Guard::new(settings, true));
     let mut count = 0;
-    let result = replay(&flight, &mut Echo, tracker, |_| {
+    let result = replay(&flight, &mut Echo, tracker, guard, |_| {
         count += 1;
         Err("full")
     });
     assert_eq!((result, count), (Err("full"), 1));
+}
+
+#[test]
+fn the_guard_stands_between_the_localizer_and_the_tracker() {
+    let folder = tempfile::tempdir().expect("a folder");
+    // The same file three times in a row; then another, and the file again.
+    let rows = "good.png,1000000000,1,0,25.2,55.3,,500,,\n\
+                good.png,2000000000,1,0,,,,,,\n\
+                good.png,3000000000,1,0,,,,,,\n\
+                good2.png,4000000000,1,0,,,,,,\n\
+                good.png,5000000000,1,0,,,,,,\n";
+    let flight = flight(folder.path(), rows);
+    let (lines, report) = run(&flight);
+    let statuses: Vec<_> = lines.iter().map(|line| line["status"].as_str().unwrap()).collect();
+    assert_eq!(statuses, ["fix", "fix", "no_fix", "fix", "fix"]);
+    assert_eq!(lines[2]["reason"], "held_back");
+    assert!(lines[2]["detail"].as_str().unwrap().contains("frozen") && lines[2].get("lat_deg").is_none());
+    // Frame 4 starts from the fix of frame 2: what was held back is no prior.
+    assert_eq!((&lines[3]["prior"]["chain"], &lines[3]["prior"]["age_s"]), (&2.into(), &2.0.into()));
+    assert_eq!(report.metrics.no_fix[&Reason::HeldBack], 1);
+
+    let settings = Settings::defaults().expect("defaults").track;
+    let (tracker, guard) = (Tracker::new(settings.clone()), Guard::new(settings, false));
+    let report = replay(&flight, &mut Echo, tracker, guard, |_| Ok::<_, ()>(())).expect("a replay");
+    assert_eq!(report.metrics.fixes, 5, "gates off");
 }

@@ -4,24 +4,21 @@
 //! homography from frame pixels to ground metres. Nothing of it is read by replay.
 
 use super::classes;
-use super::night::{self, Scene};
+use super::ground::Ground;
+use super::night;
 use super::noise::Dice;
 use super::sensor::{Faults, Sensor, View, expose};
 use super::trajectory::{Heading, Trajectory, Waypoint, lawnmower, line};
 use super::world::{WorldOptions, make_world};
-use crate::geo::{Affine, Crs, Enu, LatLon};
-use crate::map::{GeoTiff, MapCache, WindowSpec, write_rgb};
+use crate::geo::{Affine, Crs, Enu};
+use crate::map::{GeoTiff, WindowSpec, write_rgb};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 /// First exposure: 2026-01-15 20:00 UTC. Simulated flights have no clock.
 const FIRST_STAMP_NS: i64 = 1_768_507_200_000_000_000;
-/// Side of the square that counts as the footprint, metres.
-const FOOTPRINT_M: f64 = 512.0;
 /// Attempts to find a place for one frame.
 const ATTEMPTS: usize = 20_000;
-/// Decoded tiles kept while the scene is read.
-const CACHE_BYTES: usize = 256 << 20;
 /// Where procedural worlds lie: EPSG code and the top-left corner, metres. Nominal.
 const WORLD_PLACE: (u32, f64, f64) = (32640, 378_000.0, 2_802_000.0);
 
@@ -141,13 +138,13 @@ pub fn simulate(options: &SimulateOptions, mut progress: impl FnMut(usize, usize
     };
     let frames_folder = options.out.join("frames");
     std::fs::create_dir_all(&frames_folder).map_err(file_error(&frames_folder))?;
-    let ground = Ground::open(options)?;
+    let ground = open(options)?;
     let night = night::render(&ground.scene, options.seed);
 
     let mut dice = Dice::new(options.seed, 200);
     let mut exposure = Dice::new(options.seed, 201);
     let mut faults = Faults::draw(&options.sensor, &mut exposure);
-    let way = ground.way(options, &mut dice)?;
+    let way = way(&ground, options, &mut dice)?;
     let mut poses = String::from(
         "file,stamp_ns,agl_m,gsd_m,yaw_deg,pitch_deg,roll_deg,prior_lat_deg,prior_lon_deg,prior_radius_m,truth_lat_deg,truth_lon_deg,truth_yaw_deg\n",
     );
@@ -268,150 +265,61 @@ struct Stop {
     view: View,
 }
 
-/// The map under the flight.
-struct Ground {
-    scene: Scene,
-    window: WindowSpec,
-    map_name: String,
-    has_classes: bool,
+/// The stops of the flight.
+fn way(ground: &Ground, options: &SimulateOptions, dice: &mut Dice) -> Result<Vec<Stop>, SimulateError> {
+    let gsd = options.sensor.gsd_m(options.agl_m);
+    let (width_m, height_m) = (gsd * options.sensor.width as f64, gsd * options.sensor.height as f64);
+    let n = ground.scene.size_px as f64;
+    let (mut left, mut right, mut top, mut bottom) = (n, 0.0_f64, n, 0.0_f64);
+    for (i, _) in ground.scene.valid.iter().enumerate().filter(|(_, v)| **v == 1) {
+        let (x, y) = ((i % ground.scene.size_px) as f64, (i / ground.scene.size_px) as f64);
+        (left, right, top, bottom) = (left.min(x), right.max(x), top.min(y), bottom.max(y));
+    }
+    let reach = width_m.hypot(height_m) / 2.0 / ground.window.m_per_px * 1.02;
+    let rect = (left + reach, right - reach, top + reach, bottom - reach);
+    let planned = match options.trajectory {
+        Trajectory::Random => None,
+        _ if rect.0 >= rect.1 || rect.2 >= rect.3 => return Err(SimulateError::NoPlace { frame: 0, width_m, height_m }),
+        Trajectory::Lawnmower => Some(lawnmower(rect, ground.window.m_per_px, options.lane_m, options.frames)),
+        Trajectory::Line => Some(line(rect, ground.window.m_per_px, options.frames, dice)),
+    };
+    let mut stops = Vec::with_capacity(options.frames);
+    for frame in 0..options.frames {
+        let fixed = planned.as_ref().and_then(|p| p.get(frame)).copied();
+        let stop = (0..ATTEMPTS).find_map(|_| {
+            let waypoint = fixed.unwrap_or_else(|| Waypoint {
+                x: dice.range(left, right),
+                y: dice.range(top, bottom),
+                track_deg: dice.range(0.0, 360.0),
+                along_m: 0.0,
+            });
+            let yaw_deg = match options.heading {
+                Heading::Random => dice.range(0.0, 360.0),
+                Heading::Track => waypoint.track_deg,
+                Heading::North => 0.0,
+            };
+            let sigma = options.attitude_noise_deg;
+            let view = View { agl_m: options.agl_m, yaw_deg, pitch_deg: sigma * dice.normal(), roll_deg: sigma * dice.normal() };
+            ground.holds(&waypoint, &view, &options.sensor).then_some(Stop { waypoint, view })
+        });
+        stops.push(stop.ok_or(SimulateError::NoPlace { frame, width_m, height_m })?);
+    }
+    Ok(stops)
 }
 
-impl Ground {
-    /// Opens or makes the map and reads the area of the flight.
-    fn open(options: &SimulateOptions) -> Result<Self, SimulateError> {
-        let (path, classes_path) = match &options.source {
-            MapSource::World(world) => {
-                let paths = (options.out.join("world.tif"), options.out.join("world_classes.tif"));
-                write_world(world, &paths.0, &paths.1)?;
-                (paths.0, Some(paths.1))
-            }
-            MapSource::File { map, classes } => {
-                let stem = map.file_stem().unwrap_or_default().to_string_lossy();
-                let beside = map.with_file_name(format!("{stem}_classes.tif"));
-                (map.clone(), classes.clone().or_else(|| beside.is_file().then_some(beside)))
-            }
-        };
-        let map = GeoTiff::open(&path)?;
-        let codes = match &classes_path {
-            Some(p) => Some(classes::read(p, map.size_px()).map_err(|why| SimulateError::File { path: p.clone(), why })?),
-            None => None,
-        };
-        let (size_px, affine, name) = (map.size_px(), *map.affine(), map.name().to_owned());
-        let window = area(&map, options)?;
-        let pixels = MapCache::new(map, CACHE_BYTES).window(&window)?;
-        let m_per_px = window.m_per_px as f32;
-        let mut cover = night::guess_cover(&pixels.rgb, pixels.size_px, m_per_px);
-        if let Some(codes) = &codes {
-            read_cover(&mut cover, codes, size_px, &affine, &Affine(pixels.map_affine), pixels.size_px);
+/// Opens or makes the map and reads the area of the flight.
+fn open(options: &SimulateOptions) -> Result<Ground, SimulateError> {
+    let (path, classes) = match &options.source {
+        MapSource::World(world) => {
+            let paths = (options.out.join("world.tif"), options.out.join("world_classes.tif"));
+            write_world(world, &paths.0, &paths.1)?;
+            (paths.0, Some(paths.1))
         }
-        let scene = Scene { size_px: pixels.size_px, m_per_px, rgb: pixels.rgb.clone(), valid: pixels.valid.clone(), cover };
-        Ok(Self { scene, window, map_name: name, has_classes: codes.is_some() })
-    }
-
-    /// Scene pixel -> position.
-    fn position(&self, x: f64, y: f64) -> LatLon {
-        let middle = (self.scene.size_px as f64 - 1.0) / 2.0;
-        let m = self.window.m_per_px;
-        self.window.centre.offset(Enu { east_m: (x - middle) * m, north_m: (middle - y) * m })
-    }
-
-    /// Position -> scene pixel.
-    fn pixel(&self, at: LatLon) -> [f64; 2] {
-        let middle = (self.scene.size_px as f64 - 1.0) / 2.0;
-        let offset = self.window.centre.enu_to(at);
-        [middle + offset.east_m / self.window.m_per_px, middle - offset.north_m / self.window.m_per_px]
-    }
-
-    /// Scene pixel of a position, and the scene pixels per metre towards its own true east and north (meridians
-    /// converge over the area).
-    fn local_axes(&self, at: LatLon) -> [[f64; 2]; 3] {
-        let origin = self.pixel(at);
-        let axis = |by: Enu| {
-            let end = self.pixel(at.offset(by));
-            [(end[0] - origin[0]) / 200.0, (end[1] - origin[1]) / 200.0]
-        };
-        [origin, axis(Enu { east_m: 200.0, north_m: 0.0 }), axis(Enu { east_m: 0.0, north_m: 200.0 })]
-    }
-
-    /// The stops of the flight.
-    fn way(&self, options: &SimulateOptions, dice: &mut Dice) -> Result<Vec<Stop>, SimulateError> {
-        let gsd = options.sensor.gsd_m(options.agl_m);
-        let (width_m, height_m) = (gsd * options.sensor.width as f64, gsd * options.sensor.height as f64);
-        let n = self.scene.size_px as f64;
-        let (mut left, mut right, mut top, mut bottom) = (n, 0.0_f64, n, 0.0_f64);
-        for (i, _) in self.scene.valid.iter().enumerate().filter(|(_, v)| **v == 1) {
-            let (x, y) = ((i % self.scene.size_px) as f64, (i / self.scene.size_px) as f64);
-            (left, right, top, bottom) = (left.min(x), right.max(x), top.min(y), bottom.max(y));
-        }
-        let reach = width_m.hypot(height_m) / 2.0 / self.window.m_per_px * 1.02;
-        let rect = (left + reach, right - reach, top + reach, bottom - reach);
-        let planned = match options.trajectory {
-            Trajectory::Random => None,
-            _ if rect.0 >= rect.1 || rect.2 >= rect.3 => return Err(SimulateError::NoPlace { frame: 0, width_m, height_m }),
-            Trajectory::Lawnmower => Some(lawnmower(rect, self.window.m_per_px, options.lane_m, options.frames)),
-            Trajectory::Line => Some(line(rect, self.window.m_per_px, options.frames, dice)),
-        };
-        let mut stops = Vec::with_capacity(options.frames);
-        for frame in 0..options.frames {
-            let fixed = planned.as_ref().and_then(|p| p.get(frame)).copied();
-            let stop = (0..ATTEMPTS).find_map(|_| {
-                let waypoint = fixed.unwrap_or_else(|| Waypoint {
-                    x: dice.range(left, right),
-                    y: dice.range(top, bottom),
-                    track_deg: dice.range(0.0, 360.0),
-                    along_m: 0.0,
-                });
-                let yaw_deg = match options.heading {
-                    Heading::Random => dice.range(0.0, 360.0),
-                    Heading::Track => waypoint.track_deg,
-                    Heading::North => 0.0,
-                };
-                let sigma = options.attitude_noise_deg;
-                let view =
-                    View { agl_m: options.agl_m, yaw_deg, pitch_deg: sigma * dice.normal(), roll_deg: sigma * dice.normal() };
-                self.holds(&waypoint, &view, &options.sensor).then_some(Stop { waypoint, view })
-            });
-            stops.push(stop.ok_or(SimulateError::NoPlace { frame, width_m, height_m })?);
-        }
-        Ok(stops)
-    }
-
-    /// Whether the whole frame looks at valid map.
-    fn holds(&self, waypoint: &Waypoint, view: &View, sensor: &Sensor) -> bool {
-        let h = sensor.ground_homography(view);
-        let m = self.window.m_per_px;
-        (0..=8).all(|i| {
-            (0..=8).all(|j| {
-                let (u, v) =
-                    (f64::from(i) / 8.0 * (sensor.width as f64 - 1.0), f64::from(j) / 8.0 * (sensor.height as f64 - 1.0));
-                let [e, n, w] = h.map(|[a, b, c]| a * u + b * v + c);
-                w > 0.0 && self.at(&self.scene.valid, waypoint.x + e / w / m, waypoint.y - n / w / m) == Some(1)
-            })
-        })
-    }
-
-    /// Share of water under the 512 m square about the truth, turned by the true yaw.
-    fn water_share(&self, waypoint: &Waypoint, yaw_deg: f64) -> f64 {
-        let (sin, cos) = yaw_deg.to_radians().sin_cos();
-        let m = self.window.m_per_px;
-        let (mut water, mut all) = (0_u32, 0_u32);
-        for i in 0..128 {
-            for j in 0..128 {
-                let [u, v] = [i, j].map(|k| ((f64::from(k) + 0.5) / 128.0 - 0.5) * FOOTPRINT_M);
-                let code = self.at(&self.scene.cover, waypoint.x + (cos * u - sin * v) / m, waypoint.y + (sin * u + cos * v) / m);
-                water += u32::from(code == Some(5));
-                all += 1;
-            }
-        }
-        f64::from(water) / f64::from(all)
-    }
-
-    /// The nearest value of a scene raster.
-    fn at(&self, raster: &[u8], x: f64, y: f64) -> Option<u8> {
-        let (x, y, n) = (x.round(), y.round(), self.scene.size_px);
-        let inside = x >= 0.0 && y >= 0.0 && x < n as f64 && y < n as f64;
-        inside.then(|| raster.get(y as usize * n + x as usize).copied()).flatten()
-    }
+        MapSource::File { map, classes } => (map.clone(), classes.clone()),
+    };
+    let map = GeoTiff::open(&path)?;
+    let window = area(&map, options)?;
+    Ground::read(map, &path, classes.as_deref(), &window)
 }
 
 /// The square to render: the whole map, or of a larger one a part drawn from the seed.
@@ -435,24 +343,6 @@ fn area(map: &GeoTiff, options: &SimulateOptions) -> Result<WindowSpec, Simulate
     let centre = middle.offset(Enu { east_m: place(lo.east_m, hi.east_m), north_m: place(lo.north_m, hi.north_m) });
     let width_m = (hi.east_m - lo.east_m).max(hi.north_m - lo.north_m).min(options.area_m);
     Ok(WindowSpec { centre, width_m, m_per_px: map.m_per_px().clamp(1.0, 10.0) })
-}
-
-/// Lays the land-cover map over the guess, wherever it says something.
-fn read_cover(cover: &mut [u8], codes: &[u8], size_px: (u32, u32), map: &Affine, window: &Affine, n: usize) {
-    let Some(to_map) = map.inverse() else { return };
-    for (i, slot) in cover.iter_mut().enumerate() {
-        let (x, y) = window.apply((i % n) as f64, (i / n) as f64);
-        let (px, py) = to_map.apply(x, y);
-        let (px, py) = (px.round(), py.round());
-        if px >= 0.0 && py >= 0.0 && px < f64::from(size_px.0) && py < f64::from(size_px.1) {
-            match codes.get(py as usize * size_px.0 as usize + px as usize) {
-                Some(code @ 1..=5) => *slot = *code,
-                // Unlabelled: the guess stands, but not as water, which is always labelled where a class map exists.
-                _ if *slot == 5 => *slot = 0,
-                _ => {}
-            }
-        }
-    }
 }
 
 /// Makes a world and writes it with its land cover.

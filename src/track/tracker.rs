@@ -201,12 +201,12 @@ impl Tracker {
 }
 
 /// Seconds from `from_ns` to `to_ns`.
-fn age_s(to_ns: i64, from_ns: i64) -> f64 {
+pub(super) fn age_s(to_ns: i64, from_ns: i64) -> f64 {
     (i128::from(to_ns) - i128::from(from_ns)) as f64 / 1e9
 }
 
 /// Square root of the larger eigenvalue of a covariance, metres: no axis is worse.
-fn largest_sigma_m(covariance_m2: &[[f64; 2]; 2]) -> f64 {
+pub(super) fn largest_sigma_m(covariance_m2: &[[f64; 2]; 2]) -> f64 {
     let [[ee, en], [_, nn]] = *covariance_m2;
     let mean = 0.5 * (ee + nn);
     (mean + (0.5 * (ee - nn)).hypot(en)).sqrt()
