@@ -40,12 +40,13 @@ fn a_survey_is_georeferenced_goes_on_where_it_stopped_and_is_not_mixed_with_anot
     let seen: Value = serde_json::from_slice(&std::fs::read(seen.path().join("survey.json")).unwrap()).unwrap();
     assert_eq!((&seen["epsg"], &seen["size"]), (&32640.into(), &serde_json::json!([4, 4])));
     assert_eq!(seen["transform"], serde_json::json!([180.0, 0.0, 322_400.0, 0.0, -180.0, 2_789_300.0]));
-    assert_eq!(seen["types"], serde_json::json!(["float32"; 3]));
+    assert_eq!(seen["types"], serde_json::json!(["float32", "float32", "float32"]));
     assert_eq!(seen["names"], serde_json::json!(["coverage", "median_error_m", "median_radius95_m"]));
     assert_eq!((&seen["nodata_is_nan"], &seen["area"]), (&true.into(), &"Area".into()));
 
     // The table says the same, cell by cell; the cells without map have no frames.
-    let mut table = csv::Reader::from_reader(&*read("whole", "survey.csv"));
+    let table = read("whole", "survey.csv");
+    let mut table = csv::Reader::from_reader(table.as_slice());
     let rows: Vec<csv::StringRecord> = table.records().map(Result::unwrap).collect();
     assert_eq!(rows.len(), 16);
     for (i, row) in rows.iter().enumerate() {

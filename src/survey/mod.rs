@@ -158,11 +158,11 @@ pub fn survey(
     progress(journal.done(), grid.cells());
     let block_cells = ((BLOCK_M / options.cell_m).floor() as usize).max(1);
     for block in grid.blocks(block_cells) {
-        let open: Vec<usize> = block.into_iter().filter(|cell| !journal.has(*cell)).collect();
+        let open: Vec<usize> = block.iter().copied().filter(|cell| !journal.has(*cell)).collect();
         if open.is_empty() {
             continue;
         }
-        let shots = block_shots(map_path, &grid, &open, options)?;
+        let shots = block_shots(map_path, &grid, &block, &open, options)?;
         for cell in open {
             let row = judge_cell(&grid, cell, shots.get(&cell).map_or(&[], Vec::as_slice), localizer, options)?;
             journal.add(row)?;

@@ -22,17 +22,19 @@ pub struct Shot {
     pub counts: Vec<u16>,
 }
 
-/// Renders the frames of these cells; of a cell where a frame lies nowhere whole on the map, none.
+/// Renders the frames of these cells of a block; of a cell where a frame lies nowhere whole on the map, none. The night is
+/// that of the whole block, whichever cells are asked for: a survey that goes on sees what it would have seen.
 pub fn block_shots(
     map_path: &Path,
     grid: &Grid,
+    block: &[usize],
     cells: &[usize],
     options: &SurveyOptions,
 ) -> Result<BTreeMap<usize, Vec<Shot>>, SurveyError> {
     let sensor = options.sensor();
     let gsd_m = sensor.gsd_m(options.agl_m);
     let reach_m = 1.02 * gsd_m * (options.width as f64).hypot(options.height as f64) / 2.0;
-    let window = grid.window(cells, reach_m)?;
+    let window = grid.window(block, reach_m)?;
     let ground = Ground::read(GeoTiff::open(map_path)?, map_path, None, &window)?;
     let mut shots: BTreeMap<usize, Vec<Shot>> = BTreeMap::new();
     if !ground.scene.valid.contains(&1) {
