@@ -25,6 +25,7 @@ FALLING = ("peak_mass", "peak_logit", "cycle_mass", "refine_weight", "gradient_a
 ALONE = (*CUES, "quad_scale_error", "quad_turn_deg", "prior_distance_share", "frame_texture", "map_texture")
 """Cues that are measured alone."""
 RISING_TEXTURES = ("frame_texture", "map_texture")
+CALIBRATION_BINS = 10
 MIN_TEXTURE = 5.0
 """A frame is localisable where its 16 m means differ by this many grey levels, 1-sigma (`frame_texture`)."""
 NEGATIVE = ("another place", "blank", "shutter", "noise", "hituav", "open water")
@@ -84,12 +85,11 @@ def consistency(error_m: np.ndarray, sigma_m: np.ndarray, radius95_m: np.ndarray
 
 
 def calibration_bins(p: np.ndarray, wrong: np.ndarray) -> list[dict]:
-    """Stated against found in bins of probability that hold at least 30 trials."""
+    """Stated against found in bins of as many trials each, by the stated probability."""
     bins = []
-    for low, high in ((0, 0.01), (0.01, 0.05), (0.05, 0.2), (0.2, 0.5), (0.5, 0.8), (0.8, 0.95), (0.95, 1.01)):
-        here = (p >= low) & (p < high)
-        if here.sum() >= 30:
-            bins.append({"trials": int(here.sum()), "stated": float(p[here].mean()), "found": float(wrong[here].mean())})
+    order = np.argsort(p, kind="stable")
+    for part in np.array_split(order, CALIBRATION_BINS):
+        bins.append({"trials": len(part), "stated": float(p[part].mean()), "found": float(wrong[part].mean())})
     return bins
 
 
@@ -138,6 +138,12 @@ def measure(off: dict[str, np.ndarray], bundle: Path) -> dict:
         "no_fix_reasons": dict(
             zip(*[a.tolist() for a in np.unique(on["reason"][localisable & ~fixed], return_counts=True)], strict=True)
         ),
+    }
+    shore = (on["category"] == "water") & fixed
+    numbers["service"]["over_60_percent_water"] = {
+        "frames": int((on["category"] == "water").sum()),
+        "fixes": int(shore.sum()),
+        "fixes_over_25m": int((on["error_m"][shore] > 25).sum()),
     }
     numbers["negative"] = {}
     for category in NEGATIVE:
@@ -240,12 +246,24 @@ def text(numbers: dict, command: str) -> str:
         + (", ".join(f"{k} {v}" for k, v in service["no_fix_reasons"].items()) or "none")
         + ".",
         "",
+        f"Of {service['over_60_percent_water']['frames']} further frames with more than 60 % water (a shore may be in sight) "
+        f"{service['over_60_percent_water']['fixes']} got a fix, {service['over_60_percent_water']['fixes_over_25m']} of them "
+        "beyond 25 m.",
+        "",
     ]
     lines += ["## What must not be placed", "", "| frames | trials | no fix | share | reasons |", "|---|---|---|---|---|"]
     for name, row in numbers["negative"].items():
         reasons = ", ".join(f"{k} {v}" for k, v in row["reasons"].items())
         lines.append(f"| {name} | {row['trials']} | {row['no_fix']} | {100 * row['share']:.1f} % | {reasons} |")
-    lines += ["", "## P(error > 25 m): stated and found", "", "| trials | stated | found | |", "|---|---|---|---|"]
+    lines += [
+        "",
+        "Open water: more than 99 % of the footprint.",
+        "",
+        "## P(error > 25 m): stated and found",
+        "",
+        "| trials | stated | found | |",
+        "|---|---|---|---|",
+    ]
     for name, bins in numbers["calibration"].items():
         lines += [f"| {b['trials']} | {b['stated']:.4f} | {b['found']:.4f} | {name} |" for b in bins]
     lines += ["", "![calibration, risk and coverage](calibration.jpg)", "", "## Each cue alone", ""]

@@ -29,13 +29,13 @@ from tqdm import tqdm
 WATER_SHARE = 0.6
 """A footprint with more water than this is not localisable."""
 
-OPEN_WATER_SHARE = 0.9
-"""A footprint with more water than this is open water."""
+OPEN_WATER_SHARE = 0.99
+"""A footprint with more water than this is open water: no shore in it that could be matched."""
 
 REPORT_ERRORS = {"tilt_deg": 0.5, "map_m": 1.0, "stamp_m": 0.5}
 """Errors of a `stated` flight, 1-sigma per axis: what the default error budget states (`config/nightfix.toml`)."""
 
-WATER_PLACES = 4
+WATER_PLACES = 20
 """Priors that each frame over open water is tried with."""
 
 FRAME_HEIGHT, FRAME_WIDTH = 512, 640
