@@ -1,5 +1,5 @@
 use super::*;
-use crate::config::Settings;
+use crate::config::{Settings, TrackSettings};
 use crate::geo::{Enu, LatLon};
 use crate::locate::{Fix, StageName, WindowInfo};
 use std::path::Path;
@@ -62,7 +62,7 @@ fn flight(folder: &Path, rows: &str) -> Flight {
 }
 
 fn run(flight: &Flight) -> (Vec<serde_json::Value>, ReplayReport) {
-    let settings = Settings::defaults().expect("defaults").track;
+    let settings = TrackSettings { frozen_frames: 3, ..Settings::defaults().expect("defaults").track };
     let (tracker, guard) = (Tracker::new(settings.clone()), Guard::new(settings, true));
     let mut lines = Vec::new();
     let report = replay(flight, &mut Echo, tracker, guard, |line| {
@@ -144,7 +144,7 @@ fn two_runs_give_the_same_lines() {
 fn an_error_of_the_writer_ends_the_replay() {
     let folder = tempfile::tempdir().expect("a folder");
     let flight = flight(folder.path(), "good.png,10,1,0,25.2,55.3,,500,,\ngood.png,20,1,0,,,,,,\n");
-    let settings = Settings::defaults().expect("defaults").track;
+    let settings = TrackSettings { frozen_frames: 3, ..Settings::defaults().expect("defaults").track };
     let (tracker, guard) = (Tracker::new(settings.clone()), Guard::new(settings, true));
     let mut count = 0;
     let result = replay(&flight, &mut Echo, tracker, guard, |_| {
@@ -173,7 +173,7 @@ fn the_guard_stands_between_the_localizer_and_the_tracker() {
     assert_eq!((&lines[3]["prior"]["chain"], &lines[3]["prior"]["age_s"]), (&2.into(), &2.0.into()));
     assert_eq!(report.metrics.no_fix[&Reason::HeldBack], 1);
 
-    let settings = Settings::defaults().expect("defaults").track;
+    let settings = TrackSettings { frozen_frames: 3, ..Settings::defaults().expect("defaults").track };
     let (tracker, guard) = (Tracker::new(settings.clone()), Guard::new(settings, false));
     let report = replay(&flight, &mut Echo, tracker, guard, |_| Ok::<_, ()>(())).expect("a replay");
     assert_eq!(report.metrics.fixes, 5, "gates off");

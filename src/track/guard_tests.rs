@@ -10,7 +10,7 @@ const S: i64 = 1_000_000_000;
 const T0: i64 = 1_700_000_000 * S;
 
 fn settings() -> TrackSettings {
-    crate::config::Settings::defaults().unwrap().track
+    TrackSettings { frozen_frames: 3, ..crate::config::Settings::defaults().unwrap().track }
 }
 
 fn guard() -> Guard {
