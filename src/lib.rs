@@ -11,7 +11,7 @@
 //!                       -> geo: pixel -> latitude/longitude -> bus::message::FixMessage -> Zenoh, replay, CLI
 //! ```
 //!
-//! One [`locate::Localizer`] serves the daemon, replay, the `locate` command and the tests. It is synchronous, takes
+//! One [`locate::Ladder`] of localizers serves the daemon, replay, the `locate` command and the tests. It is synchronous, takes
 //! all it needs as arguments, touches neither network nor clock, and gives the same answer for the same input.
 //!
 //! Reference: Xiao et al., STHN: Deep Homography Estimation for UAV Thermal Geo-localization with Satellite Imagery,

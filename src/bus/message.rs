@@ -77,7 +77,7 @@ pub struct FixMessage {
     pub window: Option<WindowMessage>,
     /// Named numbers for or against the fix.
     pub evidence: Evidence,
-    /// Bundle name.
+    /// Name of the bundle that answered.
     pub bundle: String,
     /// The map.
     pub map: MapId,
@@ -179,7 +179,7 @@ pub struct PriorEcho {
 }
 
 impl FixMessage {
-    /// The message for an answer.
+    /// The message for an answer; `bundle` is named where the answer names none.
     pub fn new(stamp_ns: i64, seq: u64, answer: &Answer, bundle: &str, map: &MapId) -> Self {
         let (fix, no_fix) = match &answer.outcome {
             Ok(fix) => (Some(fix), None),
@@ -212,7 +212,7 @@ impl FixMessage {
                 map_affine: w.map_affine,
             }),
             evidence: answer.evidence.clone(),
-            bundle: bundle.to_owned(),
+            bundle: answer.bundle.as_deref().unwrap_or(bundle).to_owned(),
             map: map.clone(),
             prior: answer.prior.map(|p| PriorEcho {
                 source: p.source,

@@ -3,13 +3,13 @@
 use super::{Common, Outcome, UsageError};
 use crate::bus::zenoh_config;
 use crate::config::Settings;
-use crate::locate::Localizer;
+use crate::locate::Ladder;
 use crate::map::{GeoTiff, MapCache, WindowSpec};
 use crate::model::{Bundle, Provider, Runtime};
 use serde_json::{Map, Value, json};
 use std::error::Error;
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Arguments of `nightfix check`.
 #[derive(Debug, clap::Args)]
@@ -34,9 +34,14 @@ pub fn run(common: &Common, args: Args) -> Result<Outcome, UsageError> {
             Some(runtime) => report.part("bundle", bundle(&settings, runtime)),
             None => report.part("bundle", Err("not checked: ONNX Runtime could not be loaded".into())),
         };
+        let further = match &runtime {
+            _ if settings.bundle.ladder.is_empty() => Some(Vec::new()),
+            Some(runtime) => report.part("ladder", ladder(&settings, runtime)),
+            None => report.part("ladder", Err("not checked: ONNX Runtime could not be loaded".into())),
+        };
         let map = report.part("map", map(&settings, bundle.as_ref()));
-        if let (Some(bundle), Some(map)) = (bundle, map) {
-            report.part("localizer", localizer(&settings, bundle, map));
+        if let (Some(bundle), Some(further), Some(map)) = (bundle, further, map) {
+            report.part("localizer", localizer(&settings, bundle, further, &map));
         }
     }
     report.print()
@@ -101,6 +106,17 @@ fn runtime(common: &Common, settings: &Settings) -> Part<Runtime> {
 /// Manifest, digests, graphs, golden pair on the execution provider asked for.
 fn bundle(settings: &Settings, runtime: &Runtime) -> Part<Bundle> {
     let folder = settings.bundle.path.as_deref().ok_or("configuration: bundle.path: expected a bundle's folder, found none")?;
+    open_bundle(folder, runtime)
+}
+
+/// The further bundles, all of them, each like the first.
+fn ladder(settings: &Settings, runtime: &Runtime) -> Part<Vec<Bundle>> {
+    let opened = settings.bundle.ladder.iter().map(|folder| open_bundle(folder, runtime)).collect::<Result<Vec<_>, _>>()?;
+    let (bundles, values): (Vec<Bundle>, Vec<Value>) = opened.into_iter().unzip();
+    Ok((bundles, json!({"bundles": values})))
+}
+
+fn open_bundle(folder: &Path, runtime: &Runtime) -> Part<Bundle> {
     let bundle = Bundle::open(folder, runtime)?;
     let manifest = &bundle.manifest;
     let golden: Vec<Value> =
@@ -113,7 +129,7 @@ fn bundle(settings: &Settings, runtime: &Runtime) -> Part<Bundle> {
 }
 
 /// The map opens, and somewhere on it there is room for a footprint.
-fn map(settings: &Settings, bundle: Option<&Bundle>) -> Part<MapCache> {
+fn map(settings: &Settings, bundle: Option<&Bundle>) -> Part<GeoTiff> {
     let path = settings.map.path.as_deref().ok_or("configuration: map.path: expected a GeoTIFF, found none")?;
     let map = GeoTiff::open(path)?;
     let (width_px, height_px) = map.size_px();
@@ -125,7 +141,7 @@ fn map(settings: &Settings, bundle: Option<&Bundle>) -> Part<MapCache> {
     let half_diagonal_m = 0.5 * m_per_px * f64::from(width_px).hypot(f64::from(height_px));
     let footprint_m = bundle.map_or(512.0, |bundle| bundle.manifest.frame_width_m);
     let share = settings.gates.min_map_valid;
-    let mut cache = MapCache::new(map, settings.map.cache_mib.saturating_mul(1 << 20));
+    let mut cache = MapCache::new(map.clone(), settings.map.cache_mib.saturating_mul(1 << 20));
     let middle = cache.window(&WindowSpec { centre, width_m: footprint_m, m_per_px: 1.0 })?.valid_fraction();
     // A look at the middle first: the search is coarse.
     if middle < share && !cache.can_hold(centre, half_diagonal_m, footprint_m, share)? {
@@ -138,11 +154,17 @@ fn map(settings: &Settings, bundle: Option<&Bundle>) -> Part<MapCache> {
     if let Some(object) = value.as_object_mut() {
         object.insert("valid_in_the_middle".to_owned(), middle.into());
     }
-    Ok((cache, value))
+    Ok((map, value))
 }
 
 /// All of it goes together.
-fn localizer(settings: &Settings, bundle: Bundle, map: MapCache) -> Part<()> {
-    Localizer::new(bundle, map, settings.gates.clone(), settings.budget.clone())?;
-    Ok(((), json!({})))
+fn localizer(settings: &Settings, bundle: Bundle, further: Vec<Bundle>, map: &GeoTiff) -> Part<()> {
+    let cache_bytes = settings.map.cache_mib.saturating_mul(1 << 20);
+    let ladder = Ladder::new(bundle, further, map, cache_bytes, &settings.gates, &settings.budget, &settings.search)?;
+    let rungs: Vec<Value> = ladder
+        .rungs()
+        .map(|rung| json!({"bundle": rung.bundle().manifest.name, "search_radius_m": rung.search_radius_m()}))
+        .collect();
+    let search = json!({"kind": ladder.search_kind(), "max_radius_m": settings.search.max_radius_m});
+    Ok(((), json!({"ladder": rungs, "search": search})))
 }

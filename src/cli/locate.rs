@@ -5,8 +5,7 @@ use crate::bus::FixMessage;
 use crate::config::Settings;
 use crate::daemon::equip;
 use crate::geo::LatLon;
-use crate::locate::{EncodedFrame, Prior, PriorSource, Query, Seen};
-use crate::model::StageManifest;
+use crate::locate::{EncodedFrame, Localizer, Prior, PriorSource, Query, Seen};
 use crate::thermal::{Encoding, Pose};
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
@@ -20,9 +19,9 @@ pub struct Args {
     /// Satellite map, a GeoTIFF.
     #[arg(long, value_name = "TIF")]
     map: PathBuf,
-    /// Model bundle, a folder.
-    #[arg(long, value_name = "DIR")]
-    bundle: PathBuf,
+    /// Model bundle, a folder. Several make a ladder: the smallest whose D_C covers the search radius answers.
+    #[arg(long, value_name = "DIR", value_delimiter = ',', required = true)]
+    bundle: Vec<PathBuf>,
     /// Thermal frame: PNG, TIFF, JPEG, or raw 16-bit little-endian (.y16, .raw) with --size.
     #[arg(long, value_name = "FILE")]
     frame: PathBuf,
@@ -35,7 +34,7 @@ pub struct Args {
     /// Longitude of the prior, WGS84 degrees.
     #[arg(long, allow_negative_numbers = true)]
     lon: f64,
-    /// Search radius, metres [default: D_C of the bundle].
+    /// Search radius, metres [default: D_C of the largest bundle].
     #[arg(long)]
     radius_m: Option<f64>,
     /// Ground metres per frame pixel [default: 1 where neither this nor --agl-m is given].
@@ -91,16 +90,16 @@ pub fn run(common: &Common, args: Args) -> Result<Outcome, UsageError> {
     }
     let bytes = read_frame(&args.frame, settings.daemon.max_frame_bytes as u64)?;
     settings.map.path = Some(args.map.clone());
-    settings.bundle.path = Some(args.bundle.clone());
+    settings.bundle.path = args.bundle.first().cloned();
+    settings.bundle.ladder = args.bundle.iter().skip(1).cloned().collect();
     let equipment = equip(&settings, common.onnxruntime.as_deref(), &|_| ()).map_err(|e| usage(&e))?;
     let mut localizer = equipment.localizer;
 
-    let manifest = &localizer.bundle().manifest;
-    let searches_circle = matches!(manifest.coarse, StageManifest::Correlation(_));
+    let searches_circle = localizer.rungs().any(Localizer::searches_circle);
     if args.yaw_deg.is_none() && !searches_circle {
         tracing::warn!("--yaw-deg is not given and this bundle does not search the circle: the frame is taken as north-up");
     }
-    let radius_m = args.radius_m.unwrap_or(manifest.search_radius_m);
+    let radius_m = args.radius_m.unwrap_or(localizer.largest().search_radius_m());
     if !(radius_m.is_finite() && radius_m > 0.0) {
         return Err(UsageError(format!("--radius-m: expected a positive number of metres, found {radius_m}")));
     }
@@ -115,11 +114,12 @@ pub fn run(common: &Common, args: Args) -> Result<Outcome, UsageError> {
     let prior = Prior { position: at, radius_m, sigma_m: None, source: PriorSource::External, chain: 0, age_s: None };
     let frame = EncodedFrame { bytes: &bytes, encoding, size_px: args.size };
     let query = Query { stamp_ns: args.stamp_ns, frame: Ok(frame), pose, prior: Ok(prior) };
-    let (answer, seen) = localizer.locate_seen(&query);
+    let (answer, seen) = localizer.locate_within(&query, &|| true);
     if let Some(folder) = &args.dump {
-        dump(folder, &seen, localizer.bundle().manifest.margin_px())?;
+        let rung = answer.bundle.as_deref().and_then(|name| localizer.rung(name)).unwrap_or(localizer.largest());
+        dump(folder, &seen, rung.bundle().manifest.margin_px())?;
     }
-    let message = FixMessage::new(args.stamp_ns, 0, &answer, &localizer.bundle().manifest.name, &equipment.map);
+    let message = FixMessage::new(args.stamp_ns, 0, &answer, &localizer.name(), &equipment.map);
     let text = if args.json { serde_json::to_string(&message).map_err(|e| usage(&e))? } else { for_people(&message) };
     let mut stdout = std::io::stdout().lock();
     writeln!(stdout, "{text}").map_err(|e| usage(&e))?;

@@ -1,11 +1,10 @@
 //! `nightfix replay`: a recorded flight through the localizer; `fixes.jsonl`, `metrics.json`, thresholds.
 
 use super::{Common, Outcome, UsageError};
-use crate::config::Settings;
+use crate::config::{MAX_SEARCH_RADIUS_M, Settings};
+use crate::daemon::equip;
 use crate::flight::{Flight, ReplayLine, ReplayReport, Thresholds, replay};
-use crate::locate::Localizer;
-use crate::map::{GeoTiff, MapCache};
-use crate::model::{Bundle, Provider, Runtime};
+use crate::locate::Ladder;
 use crate::track::{Guard, TrackFilter, Tracker};
 use std::io::{BufWriter, IsTerminal, Write};
 use std::path::{Path, PathBuf};
@@ -27,9 +26,13 @@ pub struct Args {
     /// The map; else the one that `flight.toml` names.
     #[arg(long, value_name = "TIF")]
     map: Option<PathBuf>,
-    /// The bundle's folder; else the configuration's.
-    #[arg(long, value_name = "DIR")]
-    bundle: Option<PathBuf>,
+    /// The bundle's folder; else the configuration's. Several make a ladder: the smallest whose D_C covers the prior answers.
+    #[arg(long, value_name = "DIR", value_delimiter = ',')]
+    bundle: Vec<PathBuf>,
+    /// Priors wider than the largest D_C are searched up to this radius, metres [default: the configuration's, which is
+    /// 0: not at all].
+    #[arg(long, value_name = "M")]
+    search_radius_m: Option<f64>,
     /// Where `fixes.jsonl` and `metrics.json` go (made if absent), and `track.jsonl` where the configuration asks for the
     /// track. The metrics are printed in any case.
     #[arg(long, value_name = "DIR")]
@@ -90,28 +93,35 @@ pub fn run(common: &Common, args: Args) -> Result<Outcome, UsageError> {
     })
 }
 
-fn prepare(common: &Common, args: &Args, settings: &Settings, flight: &Flight) -> Result<(Localizer, Tracker), UsageError> {
-    let bundle = args.bundle.as_ref().or(settings.bundle.path.as_ref());
-    let bundle =
-        bundle.ok_or_else(|| UsageError("replay: expected --bundle or a configuration that names one, found neither".into()))?;
-    let map = args.map.as_ref().or(flight.map.as_ref());
-    let map = map.ok_or_else(|| UsageError("replay: expected --map or a flight that names its map, found neither".into()))?;
-    let map = GeoTiff::open(map).map_err(|e| UsageError::from_error(&e))?;
-    let map = MapCache::new(map, settings.map.cache_mib.saturating_mul(1 << 20));
-    let onnx = &settings.onnxruntime;
-    let provider: Provider = onnx.provider.parse().map_err(|e| UsageError::from_error(&e))?;
-    let runtime = Runtime::open(common.onnxruntime.as_deref(), onnx.library.as_deref(), provider, onnx.threads)
-        .map_err(|e| UsageError::from_error(&e))?;
-    let bundle = Bundle::open(bundle, &runtime).map_err(|e| UsageError::from_error(&e))?;
-    let tracker = Tracker::new(settings.track.clone()).with_search_radius_m(bundle.manifest.search_radius_m);
-    let localizer = Localizer::new(bundle, map, settings.gates.clone(), settings.budget.clone());
-    Ok((localizer.map_err(|e| UsageError::from_error(&e))?, tracker))
+/// What the flight is replayed with: paths of the command line go before those of the configuration.
+fn prepare(common: &Common, args: &Args, settings: &Settings, flight: &Flight) -> Result<(Ladder, Tracker), UsageError> {
+    let mut settings = settings.clone();
+    if let [first, further @ ..] = args.bundle.as_slice() {
+        (settings.bundle.path, settings.bundle.ladder) = (Some(first.clone()), further.to_vec());
+    }
+    if settings.bundle.path.is_none() {
+        return Err(UsageError("replay: expected --bundle or a configuration that names one, found neither".into()));
+    }
+    settings.map.path = args.map.clone().or_else(|| flight.map.clone());
+    if settings.map.path.is_none() {
+        return Err(UsageError("replay: expected --map or a flight that names its map, found neither".into()));
+    }
+    if let Some(radius_m) = args.search_radius_m {
+        if !(0.0..=MAX_SEARCH_RADIUS_M).contains(&radius_m) {
+            return Err(UsageError(format!("--search-radius-m: expected 0 to {MAX_SEARCH_RADIUS_M}, found {radius_m}")));
+        }
+        settings.search.max_radius_m = radius_m;
+    }
+    let equipment = equip(&settings, common.onnxruntime.as_deref(), &|_| ()).map_err(|e| UsageError::from_error(&e))?;
+    let ladder = equipment.localizer;
+    let tracker = Tracker::new(settings.track.clone()).with_search_radius_m(ladder.largest().search_radius_m());
+    Ok((ladder, tracker))
 }
 
 /// Replays, writing the lines as they come.
 fn fly(
     flight: &Flight,
-    localizer: &mut Localizer,
+    localizer: &mut Ladder,
     tracker: Tracker,
     guard: Guard,
     mut filter: Option<TrackFilter>,

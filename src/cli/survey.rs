@@ -72,8 +72,10 @@ pub fn run(common: &Common, args: Args) -> Result<Outcome, UsageError> {
     let mut settings = settings.map_err(|e| usage(&e))?;
     settings.map.path = Some(args.map.clone());
     settings.bundle.path = Some(args.bundle.clone());
+    // One bundle at a time: what its fixes are worth here.
+    settings.bundle.ladder.clear();
     let equipment = equip(&settings, common.onnxruntime.as_deref(), &|_| ()).map_err(|e| usage(&e))?;
-    let mut localizer = equipment.localizer;
+    let mut localizer = equipment.localizer.into_largest();
 
     let manifest_path = args.bundle.join("bundle.toml");
     let manifest = std::fs::read(&manifest_path);

@@ -7,6 +7,10 @@ use std::str::FromStr;
 
 /// A contract, not a preference: an own fix as prior is never taken as better than this per axis, metres.
 const MIN_OWN_FIX_SIGMA_M: f64 = 50.0;
+/// Widest disc of a search, metres: beyond, the region's flat lattice no longer lies on the ellipsoid to a cell.
+pub const MAX_SEARCH_RADIUS_M: f64 = 50_000.0;
+/// Further bundles: each holds sessions and a cache of its own.
+const MAX_LADDER: usize = 8;
 
 impl Settings {
     /// Checks every value.
@@ -67,6 +71,16 @@ impl Settings {
         positive("track.track_accel_mps2", track.track_accel_mps2, 1000.0)?;
         positive("track.track_gate", track.track_gate, 1e6)?;
         whole("track.track_restart_after", track.track_restart_after.into(), 1, 1000)?;
+
+        let search = &self.search;
+        at_most("search.max_radius_m", search.max_radius_m, MAX_SEARCH_RADIUS_M)?;
+        whole("search.budget_ms", search.budget_ms, 1, 600_000)?;
+        whole("search.candidates", search.candidates.into(), 1, 32)?;
+        between("search.max_second", search.max_second, 0.0, 1.0)?;
+        whole("search.max_features_mib", search.max_features_mib as u64, 16, 65_536)?;
+        if self.bundle.ladder.len() > MAX_LADDER {
+            return Err(source.error("bundle.ladder", format!("at most {MAX_LADDER} bundles"), self.bundle.ladder.len()));
+        }
 
         let gates = &self.gates;
         between("gates.min_map_valid", gates.min_map_valid, 0.0, 1.0)?;

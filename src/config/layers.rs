@@ -53,6 +53,7 @@ impl Settings {
         ]
         .into_iter()
         .flatten()
+        .chain(&mut settings.bundle.ladder)
         {
             *path = folder.join(&*path);
         }

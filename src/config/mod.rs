@@ -7,9 +7,10 @@ mod error;
 mod layers;
 mod settings;
 
+pub use check::MAX_SEARCH_RADIUS_M;
 pub use error::ConfigError;
 pub use layers::DEFAULTS;
 pub use settings::{
-    BudgetSettings, BundleSettings, DaemonSettings, EndpointSettings, GateSettings, MapSettings, OnnxRuntimeSettings, Settings,
-    TrackSettings, VehicleSettings, ZenohSettings,
+    BudgetSettings, BundleSettings, DaemonSettings, EndpointSettings, GateSettings, MapSettings, OnnxRuntimeSettings,
+    SearchSettings, Settings, TrackSettings, VehicleSettings, ZenohSettings,
 };

@@ -20,6 +20,8 @@ pub struct Settings {
     pub camera: CameraModel,
     /// Prior and tracking.
     pub track: TrackSettings,
+    /// Search over a region.
+    pub search: SearchSettings,
     /// Gates.
     pub gates: GateSettings,
     /// Error budget.
@@ -54,6 +56,25 @@ pub struct MapSettings {
 pub struct BundleSettings {
     /// Folder of the bundle.
     pub path: Option<PathBuf>,
+    /// Folders of further bundles, with smaller or larger D_C: the smallest whose D_C covers the search disc answers.
+    pub ladder: Vec<PathBuf>,
+}
+
+/// Search over a region wider than the largest bundle's D_C.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SearchSettings {
+    /// Widest search disc, metres; 0: none is searched, a prior wider than D_C is `prior_too_wide`.
+    pub max_radius_m: f64,
+    /// Time after which the service gives up a frame's search (`deadline`), milliseconds. A replay has no clock.
+    pub budget_ms: u64,
+    /// Places that are looked at closely.
+    pub candidates: u32,
+    /// Largest ratio of another place's weight to the best one's (`ambiguous`). Stricter than within a disc
+    /// (`gates.max_second_peak`): where a place lies between cells changes its weight by half, and there are many places.
+    pub max_second: f64,
+    /// Bound on the region's features that are kept, MiB: about 1.7 per km2.
+    pub max_features_mib: usize,
 }
 
 /// ONNX Runtime.

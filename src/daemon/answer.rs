@@ -57,7 +57,7 @@ impl Inbox {
     }
 }
 
-/// Answers frames until the slot is closed and empty. `locate` is [`crate::locate::Localizer::locate`]; what it finds goes
+/// Answers frames until the slot is closed and empty. `locate` is [`crate::locate::Ladder::locate_within`]; what it finds goes
 /// past the `guard` before anything else learns of it.
 pub fn answer_frames(
     inbox: &Inbox,
@@ -115,6 +115,7 @@ fn answer(
         let no_fix = query.prior.as_ref().err().cloned().unwrap_or_else(|| late(waited, deadline));
         Answer {
             withheld: None,
+            bundle: None,
             searched: false,
             outcome: Err(no_fix),
             prior: query.prior.ok(),

@@ -55,6 +55,7 @@ fn locate(query: &Query<'_>) -> Answer {
     };
     Answer {
         withheld: None,
+        bundle: None,
         searched: false,
         outcome,
         prior: query.prior.as_ref().ok().copied(),

@@ -1,17 +1,17 @@
-//! What the service runs with: ONNX Runtime, bundle, map, localizer. Shared by `run` and `check`.
+//! What the service runs with: ONNX Runtime, bundles, map, localizer. Shared by `run`, `replay` and `locate`.
 
 use super::DaemonError;
 use crate::bus::MapId;
 use crate::config::Settings;
-use crate::locate::Localizer;
-use crate::map::{GeoTiff, MapCache};
+use crate::locate::Ladder;
+use crate::map::GeoTiff;
 use crate::model::{Bundle, Provider, Runtime};
 use std::path::{Path, PathBuf};
 
 /// What the service runs with.
 pub struct Equipment {
-    /// The localizer, its bundle's golden pair checked on the execution provider really in use.
-    pub localizer: Localizer,
+    /// The localizers, their bundles' golden pairs checked on the execution provider really in use.
+    pub localizer: Ladder,
     /// The map, for messages.
     pub map: MapId,
     /// ONNX Runtime's library.
@@ -33,12 +33,13 @@ pub fn equip(settings: &Settings, onnxruntime: Option<&Path>, progress: &dyn Fn(
 
     progress("loading the bundle and checking its golden pair");
     let bundle = Bundle::open(folder, &runtime)?;
+    let further = settings.bundle.ladder.iter().map(|folder| Bundle::open(folder, &runtime)).collect::<Result<Vec<_>, _>>()?;
 
     progress("opening the map");
     let map = GeoTiff::open(map_path)?;
     // The digest reads the whole file: done here, once, and not before the first answer.
     let id = MapId { name: map.name().to_owned(), digest: map.digest()? };
-    let cache = MapCache::new(map, settings.map.cache_mib.saturating_mul(1 << 20));
-    let localizer = Localizer::new(bundle, cache, settings.gates.clone(), settings.budget.clone())?;
+    let cache_bytes = settings.map.cache_mib.saturating_mul(1 << 20);
+    let localizer = Ladder::new(bundle, further, &map, cache_bytes, &settings.gates, &settings.budget, &settings.search)?;
     Ok(Equipment { localizer, map: id, library: runtime.library().to_owned(), provider })
 }

@@ -1,4 +1,4 @@
-//! The service: one `Localizer` on a thread of its own, Zenoh round it, systemd above it.
+//! The service: one `Ladder` on a thread of its own, Zenoh round it, systemd above it.
 //!
 //! ```text
 //! Zenoh callbacks (intake)  frame ----> slot of one, newest wins ---> inference thread (answer)

@@ -26,6 +26,7 @@ impl Outbox {
     pub fn new(health: &Health) -> Self {
         let none = Answer {
             withheld: None,
+            bundle: None,
             searched: false,
             outcome: Err(NoFix { reason: Reason::NoPrior, detail: "frame: expected one, found none since the start".to_owned() }),
             prior: None,

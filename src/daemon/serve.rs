@@ -142,15 +142,11 @@ async fn serve(
     let declaring = |what: &'static str| move |e: zenoh::Error| BusError::new(format!("declaring {what}"), e);
     let keys = Keys::new(&settings.vehicle.name);
     let deadline = Duration::from_millis(settings.daemon.deadline_ms);
+    let search_budget = Duration::from_millis(settings.search.budget_ms).min(deadline);
     let Equipment { mut localizer, map, provider, .. } = equipment;
-    let manifest = &localizer.bundle().manifest;
-    let identity = Identity {
-        vehicle: settings.vehicle.name.clone(),
-        bundle: manifest.name.clone(),
-        map,
-        provider: provider.name().to_owned(),
-    };
-    let tracker = Tracker::new(settings.track.clone()).with_search_radius_m(manifest.search_radius_m);
+    let identity =
+        Identity { vehicle: settings.vehicle.name.clone(), bundle: localizer.name(), map, provider: provider.name().to_owned() };
+    let tracker = Tracker::new(settings.track.clone()).with_search_radius_m(localizer.largest().search_radius_m());
     let guard = Guard::new(settings.track.clone(), settings.gates.enabled);
     let health = Arc::new(Health::new(identity, deadline));
     let inbox = Arc::new(Inbox::new(tracker, Attitudes::new(settings.daemon.max_attitude_age_s)));
@@ -183,7 +179,10 @@ async fn serve(
     let mut inference = {
         let (inbox, outbox, health, camera) = (inbox.clone(), outbox.clone(), health.clone(), settings.camera);
         Worker::start("inference", move || {
-            answer_frames(&inbox, &outbox, &health, &camera, deadline, guard, |query| localizer.locate(query));
+            answer_frames(&inbox, &outbox, &health, &camera, deadline, guard, |query| {
+                let begun = Instant::now();
+                localizer.locate_within(query, &|| begun.elapsed() < search_budget).0
+            });
         })?
     };
     let mut publishing = {

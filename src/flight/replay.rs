@@ -5,7 +5,7 @@
 use super::format::{Flight, Row};
 use super::metrics::{Metrics, Tally};
 use crate::bus::{FixMessage, MapId};
-use crate::locate::{Answer, EncodedFrame, Localizer, NoFix, Prior, PriorSource, Query, Reason};
+use crate::locate::{Answer, EncodedFrame, Ladder, NoFix, Prior, PriorSource, Query, Reason};
 use crate::thermal::{FrameError, decode};
 use crate::track::{Guard, PriorReport, Spread, Tracker};
 use serde::Serialize;
@@ -31,7 +31,7 @@ pub struct ReplayReport {
     pub unreadable: usize,
 }
 
-/// Whoever answers queries: the [`Localizer`], or a stand-in in tests.
+/// Whoever answers queries: the [`Ladder`], or a stand-in in tests.
 pub trait Locate {
     /// Where was the vehicle?
     fn locate(&mut self, query: &Query<'_>) -> Answer;
@@ -39,13 +39,13 @@ pub trait Locate {
     fn identity(&self) -> (String, MapId);
 }
 
-impl Locate for Localizer {
+impl Locate for Ladder {
     fn locate(&mut self, query: &Query<'_>) -> Answer {
         Self::locate(self, query)
     }
     fn identity(&self) -> (String, MapId) {
         let (name, digest) = self.map_id();
-        (self.bundle().manifest.name.clone(), MapId { name, digest })
+        (self.name(), MapId { name, digest })
     }
 }
 

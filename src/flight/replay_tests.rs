@@ -36,6 +36,7 @@ impl Locate for Echo {
             outcome,
             prior,
             withheld: None,
+            bundle: None,
             searched: false,
             window,
             evidence: Default::default(),

@@ -112,6 +112,8 @@ pub struct Answer {
     pub withheld: Option<Reason>,
     /// The prior that was used.
     pub prior: Option<Prior>,
+    /// Name of the bundle that answered; none where no bundle was asked.
+    pub bundle: Option<String>,
     /// Whether it was found by a search beyond the bundle's D_C: never published before another frame confirms it.
     pub searched: bool,
     /// The window, where one was made.

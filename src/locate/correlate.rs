@@ -118,21 +118,23 @@ impl Correlator {
 }
 
 /// Buffers of one transform size.
-struct Work {
+pub(super) struct Work {
     n: usize,
     rows: Vec<Complex32>,
-    columns: Vec<Complex32>,
+    /// The transform, column by column.
+    pub columns: Vec<Complex32>,
     scratch: Vec<Complex32>,
 }
 
 impl Work {
-    fn new(n: usize, scratch: usize) -> Self {
+    /// For transforms of `n` values that need this much scratch.
+    pub fn new(n: usize, scratch: usize) -> Self {
         let zeros = |len: usize| vec![Complex32::default(); len];
         Self { n, rows: zeros(n * n), columns: zeros(n * n), scratch: zeros(scratch) }
     }
 
     /// Loads a pair of square planes into the top left of the rows.
-    fn load(&mut self, real: &[f32], imaginary: &[f32], cells: usize) {
+    pub fn load(&mut self, real: &[f32], imaginary: &[f32], cells: usize) {
         for (y, row) in self.rows.chunks_exact_mut(self.n).take(cells).enumerate() {
             row.fill(Complex32::default());
             let span = y * cells..(y + 1) * cells;
@@ -146,7 +148,7 @@ impl Work {
     }
 
     /// Transforms the first `used` rows (the others are zero), then all columns, into `columns`.
-    fn transform(&mut self, used: usize, fft: &dyn Fft<f32>) {
+    pub fn transform(&mut self, used: usize, fft: &dyn Fft<f32>) {
         let n = self.n;
         let used = used.min(n);
         if let Some(rows) = self.rows.get_mut(..used * n) {
@@ -163,7 +165,7 @@ impl Work {
     }
 
     /// Transforms a product (columns) back and appends its real part at the first `size` shifts.
-    fn inverse_into(&mut self, product: &mut [Complex32], size: [usize; 2], fft: &dyn Fft<f32>, logits: &mut Vec<f32>) {
+    pub fn inverse_into(&mut self, product: &mut [Complex32], size: [usize; 2], fft: &dyn Fft<f32>, logits: &mut Vec<f32>) {
         let n = self.n;
         fft.process_with_scratch(product, &mut self.scratch);
         let scale = 1.0 / (n * n) as f32;

@@ -15,7 +15,7 @@ use crate::thermal::{Pose, Rectified, decode, rectify, tone_map};
 use std::sync::Arc;
 
 /// R may exceed D_C by rounding, no more.
-const RADIUS_SLACK: f64 = 1e-6;
+pub(super) const RADIUS_SLACK: f64 = 1e-6;
 
 /// What can be wrong when a localizer is put together (never while it answers).
 #[derive(Debug, thiserror::Error)]
@@ -94,12 +94,28 @@ impl Localizer {
             *latency_ms.entry((*name).to_owned()).or_insert(0.0) += ms;
         }
         let OnTheWay { prior, window, evidence, seen, withheld } = on_the_way;
-        (Answer { outcome, withheld, prior, searched: false, window, evidence, latency_ms }, seen)
+        let bundle = Some(self.bundle.manifest.name.clone());
+        (Answer { outcome, withheld, prior, bundle, searched: false, window, evidence, latency_ms }, seen)
     }
 
     /// The bundle.
     pub fn bundle(&self) -> &Bundle {
         &self.bundle
+    }
+
+    /// D_C: the widest disc that it searches, metres, where the frame's footprint is whole.
+    pub fn search_radius_m(&self) -> f64 {
+        self.bundle.manifest.search_radius_m
+    }
+
+    /// Whether it can do without a yaw.
+    pub fn searches_circle(&self) -> bool {
+        matches!(self.bundle.manifest.coarse, StageManifest::Correlation(_))
+    }
+
+    /// What a search over a region works with: the bundle, the map, the gates, the map's middle.
+    pub(super) fn parts(&mut self) -> (&mut Bundle, &mut MapCache, &GateSettings, LatLon) {
+        (&mut self.bundle, &mut self.windows.map, &self.gates, self.map_centre)
     }
 
     /// The map's file name and digest, for messages.
@@ -254,11 +270,10 @@ impl Localizer {
     }
 
     /// Decode, tone mapping, rectification: `bad_frame`. Also the pose that was assumed.
-    fn read_frame(&self, query: &Query<'_>, steps: &mut Steps) -> Result<(Rectified, Pose), NoFix> {
+    pub(super) fn read_frame(&self, query: &Query<'_>, steps: &mut Steps) -> Result<(Rectified, Pose), NoFix> {
         let bad = |e: &dyn std::fmt::Display| NoFix::new(Reason::BadFrame, e.to_string());
         let encoded = query.frame.as_ref().map_err(|e| bad(e))?;
-        let searches_circle = matches!(self.bundle.manifest.coarse, StageManifest::Correlation(_));
-        if query.pose.yaw_deg.is_none() && !searches_circle {
+        if query.pose.yaw_deg.is_none() && !self.searches_circle() {
             return Err(bad(&"yaw_deg: expected a known yaw (this bundle does not search the circle), found none"));
         }
         let raw = decode(encoded.bytes, encoded.encoding, encoded.size_px).map_err(|e| bad(&e))?;
@@ -275,7 +290,7 @@ impl Localizer {
     }
 
     /// `off_map`.
-    fn judge_map_reach(&mut self, prior: &Prior, scale: f64) -> Result<(), NoFix> {
+    pub(super) fn judge_map_reach(&mut self, prior: &Prior, scale: f64) -> Result<(), NoFix> {
         let side_m = scale * self.bundle.manifest.frame_width_m;
         let share = self.gates.min_map_valid;
         let held = self.windows.map.can_hold(prior.position, prior.radius_m, side_m, share);

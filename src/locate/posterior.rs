@@ -36,6 +36,8 @@ pub struct Peak {
     pub entropy_bits: f64,
     /// Highest logit.
     pub peak_logit: f64,
+    /// Logarithm of the mass round the peak before the posterior is normalised: of one frame, comparable between discs.
+    pub peak_log_mass: f64,
     /// Which hypothesis it is of.
     pub hypothesis: usize,
 }
@@ -116,7 +118,18 @@ impl Surface<'_> {
         let entropy_bits = mass.iter().filter(|m| **m > 0.0).map(|m| -m * m.log2()).sum();
         let second_peak = second / peak_mass;
         let peak_logit = f64::from(highest);
-        Some(Peak { shift, rotation_deg, scale, peak_mass, second_peak, entropy_bits, peak_logit, hypothesis: best_b })
+        let peak_log_mass = peak_logit + (peak_mass * total).ln();
+        Some(Peak {
+            shift,
+            rotation_deg,
+            scale,
+            peak_mass,
+            second_peak,
+            entropy_bits,
+            peak_logit,
+            peak_log_mass,
+            hypothesis: best_b,
+        })
     }
 
     fn rotation_and_scale(&self, best_b: usize, x: i64, y: i64) -> Option<(f64, f64)> {

@@ -13,7 +13,7 @@ use crate::homography::{Displacement, Quad, box_of_inclusive};
 use crate::model::{Bundle, CorrelationStage, Dim, Graph, Manifest, MatcherStage, Outputs, StageManifest, Tensor};
 
 /// Most hypotheses encoded at once: bounds memory when all of the circle is tried.
-const MAX_BATCH: usize = 32;
+pub const MAX_BATCH: usize = 32;
 
 /// Centre, rotation and scale of the frame's square in the window.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -199,6 +199,7 @@ fn put_peak(peak: &Peak, evidence: &mut Evidence) {
         ("second_peak", peak.second_peak),
         ("entropy_bits", peak.entropy_bits),
         ("peak_logit", peak.peak_logit),
+        ("peak_log_mass", peak.peak_log_mass),
         ("coarse_rotation_deg", peak.rotation_deg),
         ("coarse_scale", peak.scale),
     ] {

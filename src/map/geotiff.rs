@@ -19,7 +19,9 @@ const SUBFILE_MASK: u64 = 4;
 const NODATA: (u16, &str) = (42113, "GDAL_NODATA");
 const METADATA: (u16, &str) = (42112, "GDAL_METADATA");
 
-/// An open GeoTIFF: header read and checked, no pixel decoded. [`super::MapCache`] reads its pixels.
+/// An open GeoTIFF: header read and checked, no pixel decoded. [`super::MapCache`] reads its pixels. Clones share the open
+/// file, and the digest where it was computed before.
+#[derive(Clone)]
 pub struct GeoTiff {
     path: PathBuf,
     name: String,

@@ -29,6 +29,7 @@ fn fix(stamp_ns: i64, seq: u64, at: Enu, sigma_m: f64) -> FixMessage {
         outcome: Ok(fix),
         withheld: None,
         prior: None,
+        bundle: None,
         searched: false,
         window: None,
         evidence: Default::default(),

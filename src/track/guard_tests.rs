@@ -43,7 +43,16 @@ fn answer(at: LatLon, prior: Prior) -> Answer {
         homography: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
     };
     let (evidence, latency_ms) = (BTreeMap::new(), BTreeMap::new());
-    Answer { outcome: Ok(fix), withheld: None, prior: Some(prior), searched: false, window: None, evidence, latency_ms }
+    Answer {
+        outcome: Ok(fix),
+        withheld: None,
+        prior: Some(prior),
+        bundle: None,
+        searched: false,
+        window: None,
+        evidence,
+        latency_ms,
+    }
 }
 
 fn searched(at: LatLon, radius_m: f64) -> Answer {

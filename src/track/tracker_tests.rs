@@ -33,6 +33,7 @@ fn answer(outcome: Result<Fix, NoFix>, prior: Option<Prior>) -> Answer {
         outcome,
         withheld: None,
         prior,
+        bundle: None,
         searched: false,
         window: None,
         evidence: BTreeMap::new(),

@@ -12,11 +12,12 @@ const ORIGIN: [f64; 2] = [322_400.0, 2_789_300.0];
 
 /// Writes it; black (nodata 0) where `absent` says so.
 pub fn write(path: &Path, land: &Landscape, absent: impl Fn(usize, usize) -> bool) {
-    let level = |i: usize| {
-        let (x, y) = (i % MAP_PX, i / MAP_PX);
-        if absent(x, y) { 0 } else { land.level(x as f64, y as f64).max(1) }
-    };
-    let pixels: Vec<u8> = (0..MAP_PX * MAP_PX).flat_map(|i| [level(i); 3]).collect();
+    write_levels(path, |x, y| if absent(x, y) { 0 } else { land.level(x as f64, y as f64).max(1) });
+}
+
+/// Writes one of any brightness; 0 is nodata.
+pub fn write_levels(path: &Path, level: impl Fn(usize, usize) -> u8) {
+    let pixels: Vec<u8> = (0..MAP_PX * MAP_PX).flat_map(|i| [level(i % MAP_PX, i / MAP_PX); 3]).collect();
     let mut encoder = TiffEncoder::new(std::fs::File::create(path).unwrap()).unwrap();
     let mut image = encoder.new_image::<RGB8>(MAP_PX as u32, MAP_PX as u32).unwrap();
     let tags = image.encoder();
