@@ -72,6 +72,8 @@ impl Localizer {
         check_settings(&gates, &budget)?;
         let map_centre = map.map().centre()?;
         let map_id = (map.map().name().to_owned(), map.map().digest()?);
+        // Half a pixel: no map says better than that where a thing is.
+        let budget = BudgetSettings { map_sigma_m: budget.map_sigma_m.max(map.map().m_per_px() / 2.0), ..budget };
         Ok(Self { bundle, windows: Windows::new(map), map_centre, map_id, gates, budget })
     }
 
