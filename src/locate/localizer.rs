@@ -4,11 +4,11 @@ use super::cues;
 use super::gates::{judge_distance, judge_evidence, judge_frame, judge_map, judge_probability, judge_quad, map_valid_share};
 use super::inputs::{FrameView, WindowView};
 use super::pair::{PairError, PairMatch, Search, Steps, match_pair, similarity_of};
+use super::scaled::{affine_at_metres, homography_at_metres, inner_affine, scale_for};
 use super::windows::{WindowError, Windows, window_centre};
 use super::{Answer, Evidence, Fix, NoFix, Prior, Query, Reason, StageName, WindowInfo, budget};
 use crate::config::{BudgetSettings, GateSettings};
 use crate::geo::LatLon;
-use crate::homography::Homography;
 use crate::map::{MapCache, MapError, Window, WindowSpec};
 use crate::model::{Bundle, Judgement, StageManifest};
 use crate::thermal::{Pose, Rectified, decode, rectify, tone_map};
@@ -260,17 +260,6 @@ impl Localizer {
         Err(NoFix::new(Reason::PriorTooWide, detail))
     }
 
-    /// The scale at which a frame is matched: 1, but less where its footprint is smaller than the bundle's and the bundle
-    /// supports it (`scale_range`). Then frame, window and D_C shrink together and the pixels stay as many.
-    fn scale_for(&self, footprint_m: Option<f64>) -> f64 {
-        let manifest = &self.bundle.manifest;
-        let (Some([least, _]), Some(footprint_m)) = (manifest.scale_range, footprint_m) else { return 1.0 };
-        let share = footprint_m / manifest.frame_width_m;
-        // In steps of 1/8 octave: a window is kept while the height varies a little.
-        let stepped = 2f64.powf((share.log2() * 8.0).floor() / 8.0);
-        if share >= FULL_FOOTPRINT || !stepped.is_finite() { 1.0 } else { stepped.clamp(least, 1.0) }
-    }
-
     /// Decode, tone mapping, rectification: `bad_frame`. Also the pose that was assumed.
     pub(super) fn read_frame(&self, query: &Query<'_>, steps: &mut Steps) -> Result<(Rectified, Pose), NoFix> {
         let bad = |e: &dyn std::fmt::Display| NoFix::new(Reason::BadFrame, e.to_string());
@@ -285,7 +274,7 @@ impl Localizer {
         // With an unknown yaw the circle is searched from north up.
         let pose = Pose { yaw_deg: query.pose.yaw_deg.or(Some(0.0)), ..query.pose };
         let manifest = &self.bundle.manifest;
-        let scale = self.scale_for(pose.footprint_m(gray.width.min(gray.height), gray.width));
+        let scale = scale_for(manifest, pose.footprint_m(gray.width.min(gray.height), gray.width));
         let frame = rectify(&gray, &pose, manifest.frame_px(), scale * manifest.m_per_px).map_err(|e| bad(&e))?;
         steps.done("rectify");
         Ok((frame, pose))
@@ -350,31 +339,6 @@ struct Seeing<'a> {
     scale: f64,
 }
 
-/// Share of the bundle's frame width from which on a footprint counts as whole.
-const FULL_FOOTPRINT: f64 = 0.8;
-
-/// An affine of window pixels at `scale` m/px as one of pixels at 1 m/px.
-fn affine_at_metres(affine: &[f64; 6], scale: f64) -> [f64; 6] {
-    let [a, b, c, d, e, f] = *affine;
-    // Pixel x at 1 m/px is (x + 0.5) / scale - 0.5 of the finer ones.
-    let shift = 0.5 / scale - 0.5;
-    [a / scale, b / scale, c + (a + b) * shift, d / scale, e / scale, f + (d + e) * shift]
-}
-
-/// A homography between squares at `scale` m/px as one between squares at 1 m/px: the frame's about its middle, the
-/// window's from its corner.
-fn homography_at_metres(found: &Homography, scale: f64, frame_px: usize) -> Homography {
-    if scale == 1.0 {
-        return *found;
-    }
-    let middle = (frame_px as f64 - 1.0) / 2.0;
-    let frame =
-        Homography([[1.0 / scale, 0.0, middle - middle / scale], [0.0, 1.0 / scale, middle - middle / scale], [0.0, 0.0, 1.0]]);
-    let shift = 0.5 * scale - 0.5;
-    let window = Homography([[scale, 0.0, shift], [0.0, scale, shift], [0.0, 0.0, 1.0]]);
-    window.after(&found.after(&frame))
-}
-
 /// What is known on the way, whichever gate closes.
 #[derive(Default)]
 struct OnTheWay {
@@ -383,13 +347,6 @@ struct OnTheWay {
     window: Option<WindowInfo>,
     evidence: Evidence,
     seen: Seen,
-}
-
-/// The affine of the window without its margin.
-fn inner_affine(window: &Window, margin_px: usize) -> [f64; 6] {
-    let [a, b, c, d, e, f] = window.map_affine;
-    let m = margin_px as f64;
-    [a, b, c + (a + b) * m, d, e, f + (d + e) * m]
 }
 
 fn no_window(error: WindowError) -> NoFix {

@@ -20,6 +20,7 @@ mod posterior;
 mod query;
 mod region;
 mod resample;
+mod scaled;
 mod search;
 mod stages;
 mod windows;
