@@ -177,7 +177,7 @@ pub struct BudgetSettings {
     pub sigma_tilt_unknown_deg: f64,
     /// Height above ground assumed for the tilt term where it is unknown, metres.
     pub assumed_agl_m: f64,
-    /// Absolute accuracy of the map per axis, metres; half a pixel of the map where that is more.
+    /// Absolute accuracy of the map per axis, metres; a pixel of the map where that is more.
     pub map_sigma_m: f64,
     /// Error of the frames' time stamps, seconds; times `speed_mps`.
     pub sigma_stamp_s: f64,

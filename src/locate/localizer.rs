@@ -14,6 +14,8 @@ use crate::model::{Bundle, Judgement, StageManifest};
 use crate::thermal::{Pose, Rectified, decode, rectify, tone_map};
 use std::sync::Arc;
 
+/// Pixels of the map over those of the window up to which a calibration holds.
+const MAX_CALIBRATED_PX: f64 = 2.0;
 /// R may exceed D_C by rounding, no more.
 pub(super) const RADIUS_SLACK: f64 = 1e-6;
 
@@ -72,8 +74,8 @@ impl Localizer {
         check_settings(&gates, &budget)?;
         let map_centre = map.map().centre()?;
         let map_id = (map.map().name().to_owned(), map.map().digest()?);
-        // Half a pixel: no map says better than that where a thing is.
-        let budget = BudgetSettings { map_sigma_m: budget.map_sigma_m.max(map.map().m_per_px() / 2.0), ..budget };
+        // A pixel: no map says much better than that where a thing is.
+        let budget = BudgetSettings { map_sigma_m: budget.map_sigma_m.max(map.map().m_per_px()), ..budget };
         Ok(Self { bundle, windows: Windows::new(map), map_centre, map_id, gates, budget })
     }
 
@@ -217,10 +219,11 @@ impl Localizer {
             way.withheld = Some(no_fix.reason);
         }
         let judgement = judgement.and_then(Result::ok);
-        // The calibration was made with a known yaw (a search of the circle tries thirty times as many hypotheses) and at
-        // the bundle's own scale.
-        let judgement = judgement.filter(|_| search.yaw_known && scale == 1.0);
-        let seen_as = Seeing { pose: &pose, agl_m: way_frame.agl_m, scale };
+        // The calibration was made with a known yaw (a search of the circle tries thirty times as many hypotheses), at the
+        // bundle's own scale and over maps about as fine as its pixels.
+        let fine = self.windows.map.map().m_per_px() <= MAX_CALIBRATED_PX * m_per_px;
+        let calibrated = search.yaw_known && scale == 1.0 && fine;
+        let seen_as = Seeing { pose: &pose, agl_m: way_frame.agl_m, scale, calibrated };
         let fix = self.fix(position, &found, &seen_as, judgement, &mut way.evidence);
         if let Some(sigma_m) = prior.sigma_m {
             let variance_m2 = sigma_m * sigma_m + fix.covariance_enu_m2[0][0].max(fix.covariance_enu_m2[1][1]);
@@ -309,8 +312,11 @@ impl Localizer {
             (StageName::Refine, Some(refine)) => refine,
             _ => &manifest.coarse,
         };
-        let (match_sigma_m, tail999) = judgement.map_or((last.match_sigma_m(), 0.0), |j| (j.sigma_m, j.tail999));
-        let Seeing { pose, agl_m, scale } = *seeing;
+        let Seeing { pose, agl_m, scale, calibrated } = *seeing;
+        // Beyond what the calibration saw its sigma still counts where it is the wider one.
+        let least_m = if calibrated { 0.0 } else { last.match_sigma_m() };
+        let (match_sigma_m, tail999) = judgement.map_or((last.match_sigma_m(), 0.0), |j| (j.sigma_m.max(least_m), j.tail999));
+        let judgement = judgement.filter(|_| calibrated);
         if scale != 1.0 {
             evidence.insert("matched_scale".into(), scale);
         }
@@ -337,6 +343,8 @@ struct Seeing<'a> {
     agl_m: Option<f64>,
     /// Of frame and window against the bundle's own.
     scale: f64,
+    /// Whether the bundle's calibration, where it has one, was made under such conditions.
+    calibrated: bool,
 }
 
 /// What is known on the way, whichever gate closes.
