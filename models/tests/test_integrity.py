@@ -87,12 +87,15 @@ def test_rust_and_numpy_judge_alike(tmp_path: Path) -> None:
     nightfix = ROOT / "target/debug/nightfix"
     if not nightfix.exists():
         pytest.skip(f"{nightfix} is not built")
-    flight = ROOT / "tests/flights/procedural"
+    # The committed flight's map is too coarse for the calibration to hold.
+    flight = tmp_path / "flight"
+    world = ["--world", "5", "--world-size-m", "1800", "--frames", "8", "--seed", "5", "--radius-m", "256", "--report-attitude"]
+    subprocess.run([nightfix, "simulate", "--out", flight, *world], check=True, capture_output=True)
     command = [nightfix, "replay", flight, "--bundle", bundle, "--out", tmp_path, "--gates", "off"]
     subprocess.run(command, check=True, capture_output=True)
     lines = [json.loads(line) for line in (tmp_path / "fixes.jsonl").open()]
     fixes = [line for line in lines if "p_over_25m" in line]
-    assert len(fixes) >= 8
+    assert len(fixes) == 8
     evidence = {cue["name"]: np.array([f["evidence"][cue["name"]] for f in fixes]) for cue in table["cues"]}
     p, sigma = model.judge(table, evidence)
     assert np.allclose(p, [f["p_over_25m"] for f in fixes], atol=1e-9)
