@@ -9,6 +9,7 @@ import math
 import tomllib
 from collections.abc import Callable
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 SCHEMA = 1
@@ -346,6 +347,14 @@ def to_toml(manifest: dict[str, Any]) -> str:
     if tomllib.loads(text) != manifest:
         raise ManifestError("bundle.toml", "a text that reads back as the manifest", text)
     return text
+
+
+def put(bundle: Path, **tables: Any) -> None:
+    """Replaces fields or tables of a bundle's `bundle.toml`, checked as ever; the graphs stay."""
+    path = bundle / "bundle.toml"
+    manifest = tomllib.loads(path.read_text()) | tables
+    check(manifest)
+    path.write_text(to_toml(ordered(manifest)))
 
 
 def _write_table(lines: list[str], path: str, table: dict[str, Any]) -> None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -167,15 +166,6 @@ def fit(trials: dict[str, np.ndarray], data: str, command: str, accept: float) -
     return table
 
 
-def put(bundle: Path, table: dict[str, Any]) -> None:
-    """Replaces the table in `bundle.toml`, through the manifest's own rules."""
-    path = bundle / "bundle.toml"
-    manifest = tomllib.loads(path.read_text())
-    manifest["integrity"] = table
-    manifest_rules.check(manifest)
-    path.write_text(manifest_rules.to_toml(manifest_rules.ordered(manifest)))
-
-
 def main(words: list[str] | None = None) -> None:
     """The command line."""
     raw = argparse.RawDescriptionHelpFormatter
@@ -186,7 +176,8 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--data", default="dubai_t4_west, naip_berkeley, procedural worlds 201 and 202 (none seen in training)")
     args = parser.parse_args(words)
     command = f"python -m sthn.integrity.fit --trials {args.trials} --bundle {args.bundle}"
-    put(args.bundle, fit(read_trials(args.trials), args.data, command, args.accept))
+    table = fit(read_trials(args.trials), args.data, command, args.accept)
+    manifest_rules.put(args.bundle, integrity=table)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ import json
 import shutil
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -162,17 +161,14 @@ def main() -> None:
 
 def put_accuracy(bundle: Path, row: dict, radius_m: float, maps: list[str]) -> None:
     """Replaces `[accuracy]` in `bundle.toml`, through the manifest's own rules."""
-    path = bundle / "bundle.toml"
-    manifest = tomllib.loads(path.read_text())
-    manifest["accuracy"] = {
+    accuracy = {
         "data": f"{', '.join(maps)}; {row['noise']}; priors uniform in the disc; gates off; under 60 % water",
         "command": f"python -m sthn.lite.bar --bundle {bundle} --maps MAPS --radius-m {radius_m:g} --put",
         "frames": row["counted"],
         "search_radius_m": radius_m,
         **{key: round(row[key], 4) for key in ("coverage", "median_m", "mean_m", "p95_m", "over_25m", "over_50m")},
     }
-    rules.check(manifest)
-    path.write_text(rules.to_toml(rules.ordered(manifest)))
+    rules.put(bundle, accuracy=accuracy)
 
 
 def table(results: list[dict]) -> str:

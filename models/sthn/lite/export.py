@@ -184,7 +184,6 @@ class Rung:
     """W_S."""
     radius_m: float = 512.0
     """D_C."""
-    accuracy: dict | None = None
     scale_range: tuple[float, float] | None = None
 
 
@@ -220,8 +219,6 @@ def export(coarse_dir: Path, refine_dir: Path | None, out: Path, name: str, rung
         "opset": OPSET,
         **{key: stage.table for key, stage in stages.items()},
     }
-    if rung.accuracy:
-        manifest["accuracy"] = rung.accuracy
     if rung.scale_range:
         manifest["scale_range"] = list(rung.scale_range)
     draft = in_memory(manifest, graphs)
@@ -269,10 +266,8 @@ def main() -> None:
     parser.add_argument("--window-m", type=float, default=1536.0, help="W_S")
     parser.add_argument("--radius-m", type=float, default=512.0, help="D_C")
     parser.add_argument("--scale-range", type=float, nargs=2, help="as measured by `sthn.lite.scales`")
-    parser.add_argument("--accuracy", type=Path, help="JSON of the [accuracy] table, from `sthn.lite.bar`")
     args = parser.parse_args()
-    accuracy = json.loads(args.accuracy.read_text()) if args.accuracy else None
-    rung = Rung(args.window_m, args.radius_m, accuracy, tuple(args.scale_range) if args.scale_range else None)
+    rung = Rung(args.window_m, args.radius_m, tuple(args.scale_range) if args.scale_range else None)
     differences = export(args.coarse, args.refine, args.out, args.name or args.out.name, rung)
     for key, value in differences.items():
         print(f"{key}: largest difference {value:.2e}")

@@ -13,7 +13,6 @@ import argparse
 import json
 import shutil
 import sys
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -32,9 +31,7 @@ def with_range(bundle: Path, out: Path, least: float) -> Path:
     if out.exists():
         shutil.rmtree(out)
     shutil.copytree(bundle, out, ignore=shutil.ignore_patterns("training"))
-    manifest = tomllib.loads((out / "bundle.toml").read_text()) | {"scale_range": [least, 1.0]}
-    manifest_rules.check(manifest)
-    (out / "bundle.toml").write_text(manifest_rules.to_toml(manifest_rules.ordered(manifest)))
+    manifest_rules.put(out, scale_range=[least, 1.0])
     return out
 
 
