@@ -143,8 +143,12 @@ fn at_the_scale_of_a_low_frame_the_disc_is_narrower_and_the_next_bundle_answers(
     for (radius_m, expected) in [(39.0, "small"), (41.0, "large"), (63.0, "large")] {
         assert_eq!(bundle(&bench.locate(&frame, pose, prior(middle(), radius_m))), expected, "{radius_m} m");
     }
-    let answer = bench.locate(&frame, pose, prior(middle(), 70.0));
-    assert_eq!((reason(&answer), bundle(&answer)), (Some(Reason::PriorTooWide), "large"));
+    // D_C holds the prior, the low frame does not; beyond D_C it is the prior.
+    for (radius_m, expected) in [(70.0, Reason::FootprintTooSmall), (128.0, Reason::FootprintTooSmall), (128.1, Reason::PriorTooWide)]
+    {
+        let answer = bench.locate(&frame, pose, prior(middle(), radius_m));
+        assert_eq!((reason(&answer), bundle(&answer)), (Some(expected), "large"), "{radius_m} m");
+    }
 }
 
 #[test]

@@ -72,15 +72,19 @@ impl Ladder {
             }
         }
         let (mut answer, seen) = self.largest.locate_seen(query);
-        let (true, Some(searcher), Some(radius_m)) = (is_too_wide(&answer), &mut self.searcher, radius_m) else {
-            return (answer, seen);
-        };
-        let most_m = searcher.max_radius_m();
-        if radius_m <= most_m {
+        let (true, Some(radius_m)) = (is_too_wide(&answer), radius_m) else { return (answer, seen) };
+        let most_m = self.searcher.as_ref().map(Searcher::max_radius_m);
+        if let (Some(searcher), true) = (&mut self.searcher, most_m.is_some_and(|most_m| radius_m <= most_m)) {
             return searcher.search(&mut self.largest, query, go_on);
         }
         if let Err(no_fix) = &mut answer.outcome {
-            no_fix.detail = format!("{}; a search goes up to {most_m} m", no_fix.detail);
+            // The bundle's D_C holds the prior; what this low frame shows does not reach that far.
+            if radius_m <= self.largest.search_radius_m() * (1.0 + RADIUS_SLACK) {
+                no_fix.reason = Reason::FootprintTooSmall;
+            }
+            if let Some(most_m) = most_m {
+                no_fix.detail = format!("{}; a search goes up to {most_m} m", no_fix.detail);
+            }
         }
         (answer, seen)
     }

@@ -139,10 +139,10 @@ impl Localizer {
         self.judge_prior(&prior)?;
         let (frame, pose) = self.read_frame(query, steps)?;
         let scale = frame.m_per_px / self.bundle.manifest.m_per_px;
-        self.judge_scaled_prior(&prior, scale)?;
         let way_frame = way.seen.frame.insert(frame);
         let view = FrameView { size_px: way_frame.size_px, gray: &way_frame.pixels, seen: &way_frame.valid };
         self.judge_map_reach(&prior, scale)?;
+        self.judge_scaled_prior(&prior, scale)?;
         judge_frame(&view, &self.gates, &mut way.evidence)?;
         let texture = cues::frame_texture(&view);
         way.evidence.insert("frame_texture".into(), texture.coarse);
@@ -249,7 +249,8 @@ impl Localizer {
         Ok(())
     }
 
-    /// `prior_too_wide` at the scale of this frame.
+    /// `prior_too_wide` at the scale of this frame. A ladder tries its next rung, or a search; where neither can, it says
+    /// `footprint_too_small`.
     fn judge_scaled_prior(&self, prior: &Prior, scale: f64) -> Result<(), NoFix> {
         let most_m = scale * self.bundle.manifest.search_radius_m;
         if prior.radius_m <= most_m * (1.0 + RADIUS_SLACK) {
