@@ -22,7 +22,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
-from ..data import DataError, PairSource, open_source
+from ..data import DataError, open_source
+from ..data.pair import TrainingSource
 from .base import RivalError, ground_m
 from .learned import NETWORKS, inputs
 
@@ -39,31 +40,30 @@ def loss_of(displacements: Tensor, truth: Tensor) -> Tensor:
 
 
 class Inputs(Dataset):
-    """Map, frame `[3, n, n]` and truth `[2, 2, 2]` (pixels of the input) of a source's pairs."""
+    """Map, frame `[3, n, n]` and truth `[2, 2, 2]` (pixels of the input) of a source's pairs, by pass and index. Every pass
+    draws anew (shift, noise, rendering), as `train.stream` does for the published network."""
 
-    def __init__(self, source: PairSource, side_px: int) -> None:
-        self.source, self.side_px = source, side_px
+    def __init__(self, source: TrainingSource, side_px: int, seed: int) -> None:
+        self.source, self.side_px, self.seed = source, side_px, seed
 
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def __getitem__(self, index: int) -> tuple[Tensor, Tensor, Tensor]:
-        pair = self.source[index]
+    def __getitem__(self, place: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+        passed, index = place
+        pair = self.source.reseeded((self.seed, passed))[index]
         return *inputs(pair, self.side_px), torch.from_numpy(pair.displacement(self.side_px)).float()
 
 
-def plan(pairs: int, batch: int, steps: int, seed: int) -> list[list[int]]:
-    """Indices of every step's batch: passes over the source, each in its own order."""
-    order, passes = [], 0
+def plan(pairs: int, batch: int, steps: int, seed: int) -> list[list[tuple[int, int]]]:
+    """Pass and index of every pair of every step's batch: passes over the source, each in its own order."""
+    order, passed = [], 0
     while len(order) < steps * batch:
-        order += np.random.default_rng([seed, passes]).permutation(pairs).tolist()
-        passes += 1
+        order += [(passed, index) for index in np.random.default_rng([seed, passed]).permutation(pairs).tolist()]
+        passed += 1
     return [order[i * batch : (i + 1) * batch] for i in range(steps)]
 
 
 def train(
     key: str,
-    source: PairSource,
+    source: TrainingSource,
     out: Path,
     steps: int,
     seed: int,
@@ -110,7 +110,7 @@ def train(
     batches = plan(len(source), batch, steps, seed)[step : stop_after or steps]
     # Its own generator: a loader draws a number at its start, which would move the dropout of a resumed run.
     own = torch.Generator()
-    loader = DataLoader(Inputs(source, side_px), batch_sampler=batches, num_workers=workers, generator=own)
+    loader = DataLoader(Inputs(source, side_px, seed), batch_sampler=batches, num_workers=workers, generator=own)
     began = time.monotonic()
     for map_image, frame, truth in tqdm(loader, key, initial=step, total=steps, mininterval=5, file=sys.stderr):
         displacements = net(map_image, frame)
@@ -137,7 +137,7 @@ def train(
         (out / "training.json").write_text(json.dumps(facts, indent=2) + "\n")
 
 
-def open_training(args: argparse.Namespace) -> PairSource:
+def open_training(args: argparse.Namespace) -> TrainingSource:
     """The source of the command line."""
     if (args.data is None) == (not args.maps):
         raise RivalError("train: expected one of --data and --maps")
