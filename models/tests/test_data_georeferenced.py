@@ -16,6 +16,7 @@ from sthn import geometry
 from sthn.data import DataError, open_source
 from sthn.data.flight import MapWindows, RecordedFlight
 from sthn.data.georeferenced import FlightPairs
+from sthn.train.stream import Stream, loader
 
 EARTH = Geod(ellps="WGS84")
 SIDE = 1800
@@ -124,6 +125,17 @@ def test_a_flight_opens_from_a_table_and_travels_to_workers(flight: Path, satell
     other = pickle.loads(pickle.dumps(source))
     assert len(source) == 2 and np.array_equal(source[1].satellite, other[1].satellite)
     assert not np.array_equal(source[0].homography, source.reseeded((3, 1))[0].homography)
+
+
+def test_loader_workers_read_the_map_as_this_process_does(flight: Path, satellite: Path) -> None:
+    """A handle that was open before the fork is one file position for all: reads fail, or are of another place."""
+    spec = {"kind": "flight", "folder": str(flight), "map": str(satellite), "window_m": 512, "search_radius_m": 300}
+    source = open_source(spec)
+    before = source[0].satellite
+    stream = Stream(source, None, 3, 64)
+    loaded = [window[0].numpy() for window, *_ in loader(stream, [[n] for n in range(16)], workers=2)]
+    assert all(np.array_equal(window, stream.pair(n).satellite) for n, window in enumerate(loaded))
+    assert np.array_equal(source[0].satellite, before)
 
 
 def test_windows_are_metres_of_true_north(satellite: Path) -> None:

@@ -6,8 +6,8 @@ The contract is ARCHITECTURE.md, "Recorded flight"; the optics are those of `src
 from __future__ import annotations
 
 import csv
-import functools
 import math
+import os
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -177,26 +177,27 @@ def _read_rows(path: Path) -> list[Row]:
 
 
 class MapWindows:
-    """North-up windows of a georeferenced map, in ground metres about their middle."""
+    """North-up windows of a georeferenced map, in ground metres about their middle. The file is opened once per process:
+    a forked loader's workers would move one another's place in it."""
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
+        self._handle: tuple[int, rasterio.DatasetReader] | None = None
         self._file()
 
-    @functools.cached_property
-    def _source(self) -> rasterio.DatasetReader:
-        return self._file()
-
     def __getstate__(self) -> dict:
-        return {"path": self.path}
+        return self.__dict__ | {"_handle": None}
 
     def _file(self) -> rasterio.DatasetReader:
+        if self._handle is not None and self._handle[0] == os.getpid():
+            return self._handle[1]
         try:
             source = rasterio.open(self.path)
         except rasterio.errors.RasterioIOError as error:
             raise DataError(self.path, "file", "a GeoTIFF", error) from error
         if source.crs is None:
             raise DataError(self.path, "CRS", "a coordinate reference system", "none")
+        self._handle = os.getpid(), source
         return source
 
     @staticmethod
@@ -213,7 +214,7 @@ class MapWindows:
 
     def window(self, centre: LatLon, size_px: int, m_per_px: float) -> NDArray[np.uint8]:
         """`[size, size, 3]`, RGB; zero where there is no map."""
-        source = self._source
+        source = self._file()
         ground = CRS.from_proj4(f"+proj=aeqd +lat_0={centre[0]!r} +lon_0={centre[1]!r} +ellps=WGS84 +units=m")
         nodes = np.linspace(0, size_px - 1, 33)
         offset = (nodes - (size_px - 1) / 2) * m_per_px
