@@ -285,6 +285,35 @@ def test_the_box_is_not_augmented_in_validation(place: Path, monkeypatch) -> Non
     assert np.isfinite(run.best_m)
 
 
+def test_a_training_that_dies_in_validation_has_its_checkpoint_and_validates_first(place: Path, whole: Path, monkeypatch) -> None:
+    out = place / "died"
+    words = [str(place / "e.toml"), "--out", str(out), "--accelerator", "cpu"]
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(loop.Loop, "_validate", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        main(words)
+    assert [p.name for p in (out / "checkpoints").iterdir()] == ["step-00000002.pt"]
+    assert main([*words, "--resume"]) == 0
+    one, other = (list(csv.DictReader((p / "validation.csv").open())) for p in (whole, out))
+    assert [row | {"seconds": ""} for row in one] == [row | {"seconds": ""} for row in other]
+    one, other = (load_file(p / "best/model.safetensors") for p in (whole, out))
+    assert all(torch.equal(value, other[key]) for key, value in one.items())
+
+
+def test_a_validation_pair_without_a_finite_answer_is_counted(place: Path) -> None:
+    made = experiment.read(place / "e.toml", ["training.steps=1", "training.batch=1"])
+    source = Numbered("real", 3)
+    run = loop.Loop(SthnTask(Sthn(TINY)), made, source, source, None, place / "counted", loop.make_fabric("32-true", "cpu"))
+    run.out.mkdir()
+    answers = iter([torch.full((1, 2, 2, 2), value) for value in (1.0, float("nan"), 1.0)])
+    run.module = torch.nn.Identity()
+    run.module.forward = lambda *_: {"final": next(answers)}
+    run._validate(0.0)
+    (row,) = csv.reader((run.out / "validation.csv").open())
+    # Truth is a frame in the corner of a window as large: every displacement is 0; a network pixel is 2 m.
+    assert [float(x) for x in row[2:]] == pytest.approx([0.0, 2 * 2**0.5 * 2 / 3, 2 * 2**0.5 * 2 / 3, 1], abs=1e-4)
+    assert (run.out / "best").is_dir()
+
+
 def test_the_schedule_and_the_optimiser_are_the_published_ones(place: Path, whole: Path) -> None:
     state = saving.load(whole / "checkpoints/step-00000004.pt")["optimiser"]["param_groups"]
     assert len(state) == 1

@@ -36,7 +36,8 @@ MOST_LEFT_OUT = 50
 """Steps in a row without finite gradients after which a training has failed."""
 
 CURVE = ("step", "seconds", "lr", "loss", "loss_coarse", "loss_fine", "mace_coarse_m", "mace_m")
-VALIDATION = ("step", "seconds", "identity_m", "mace_coarse_m", "mace_m")
+VALIDATION = ("step", "seconds", "identity_m", "mace_coarse_m", "mace_m", "not_finite")
+"""Of all validation pairs; the last: how many had no finite answer. Those count as the identity's."""
 
 
 class TrainingError(ValueError):
@@ -85,7 +86,7 @@ class Loop:
         self.task.load_state_dict(state["task"])
         self.optimiser.optimizer.load_state_dict(state["optimiser"])
         self.schedule.load_state_dict(state["schedule"])
-        self.step, self.spent_s, self.best_m = state["step"], state["spent_s"], state["best_m"]
+        self.step, self.spent_s = state["step"], state["spent_s"]
 
     def _state(self, seconds: float) -> dict[str, Any]:
         return {
@@ -94,7 +95,6 @@ class Loop:
             "schedule": self.schedule.state_dict(),
             "step": self.step,
             "spent_s": seconds,
-            "best_m": self.best_m,
         }
 
     def run(self) -> None:
@@ -104,8 +104,16 @@ class Loop:
             self.out.mkdir(parents=True, exist_ok=True)
             text = json.dumps(dataclasses.asdict(self.experiment), indent=2)
             (self.out / "experiment.json").write_text(text + "\n", encoding="utf-8")
-            for name, columns in (("curve.csv", CURVE), ("validation.csv", VALIDATION)):
-                _keep_rows(self.out / name, columns, self.step)
+            _keep_rows(self.out / "curve.csv", CURVE, self.step)
+            # The best is that of the file, as `best/` is: a checkpoint is written before its validation.
+            rows = _keep_rows(self.out / "validation.csv", VALIDATION, self.step)
+            self.best_m = min((float(row["mace_m"]) for row in rows), default=self.best_m)
+            missed = self._due("validate_every") and not any(int(row["step"]) == self.step for row in rows)
+        else:
+            missed = False
+        self.best_m, missed = self.fabric.broadcast((self.best_m, missed))
+        if missed:
+            self._validate(self.spent_s)
         steps = Steps(self.step, self.table.steps, self.table.batch, self.fabric.global_rank, self.fabric.world_size)
         batches = loader(self.stream, steps, self.table.workers)
         batches = self.fabric.setup_dataloaders(batches, use_distributed_sampler=False)
@@ -121,24 +129,26 @@ class Loop:
                         sums[key] += value
                     counted += 1
                 seconds = self.spent_s + time.monotonic() - began
-                last = self.step == self.table.steps
-                if self.step % self.table.log_every == 0 or last:
+                if self._due("log_every"):
                     means = torch.tensor([value / max(counted, 1) for value in sums.values()], dtype=torch.float64)
                     row = dict(zip(sums, self.fabric.all_reduce(means).tolist(), strict=True))
                     bar.set_postfix(mace_m=f"{row['mace_m']:.2f}")
                     if chief:
                         _append(self.out / "curve.csv", [self.step, f"{seconds:.1f}", f"{lr:.4g}", *_numbers(row.values())])
                     sums, counted = dict.fromkeys(sums, 0.0), 0
-                if self.step % self.table.validate_every == 0 or last:
+                if chief and self._due("save_every"):
+                    saving.write_atomically(self._state(seconds), self.out / f"checkpoints/step-{self.step:08}.pt")
+                if self._due("validate_every"):
                     self._validate(seconds)
-                if chief and (self.step % self.table.picture_every == 0 or last):
+                if chief and self._due("picture_every"):
                     self._picture()
-                if chief and (self.step % self.table.save_every == 0 or last):
-                    path = self.out / f"checkpoints/step-{self.step:08}.pt"
-                    saving.write_atomically(self._state(self.spent_s + time.monotonic() - began), path)
         if chief:
             self._release("final")
             saving.save_pth(self.task.nets(), self.out / "STHN.pth")
+
+    def _due(self, every: str) -> bool:
+        """Whether something is done after this step: every so many, and after the last."""
+        return self.step > 0 and (self.step % getattr(self.table, every) == 0 or self.step == self.table.steps)
 
     def _train_step(self, window: Tensor, thermal: Tensor, truth: Tensor) -> dict[str, Tensor]:
         self.module.train()
@@ -182,22 +192,25 @@ class Loop:
         mine = list(range(rank, len(self.validation), world))
         size = max(1, self.table.batch // world)
         chunks = [mine[i : i + size] for i in range(0, len(mine), size)]
-        sums = torch.zeros(4, dtype=torch.float64)
+        sums = torch.zeros(5, dtype=torch.float64)
         batches = self.fabric.setup_dataloaders(
             loader(self.validation, chunks, self.table.workers), use_distributed_sampler=False
         )
         for window, thermal, truth in batches:
             found = self.module(window, thermal, truth)
             values = [self.identity.to(truth.device), found.get("coarse", found["final"]), found["final"]]
-            sums[:3] += torch.stack([self._mace_m(v, truth).sum() for v in values]).double().cpu()
-            sums[3] += len(truth)
+            errors = torch.stack([self._mace_m(v, truth) for v in values]).double().cpu()
+            finite = torch.isfinite(errors)
+            sums[:3] += torch.where(finite, errors, errors[:1]).sum(1)
+            sums[3:] += torch.tensor([(~finite[2]).sum(), len(truth)])
         sums = self.fabric.all_reduce(sums, reduce_op="sum").cpu()
-        means = (sums[:3] / sums[3]).tolist()
+        means = _numbers((sums[:3] / sums[4]).tolist())
+        found_m = float(means[2])
         if self.fabric.is_global_zero:
-            _append(self.out / "validation.csv", [self.step, f"{seconds:.1f}", *_numbers(means)])
-            if means[2] < self.best_m:
+            if found_m < self.best_m:
                 self._release("best")
-        self.best_m = min(self.best_m, means[2])
+            _append(self.out / "validation.csv", [self.step, f"{seconds:.1f}", *means, int(sums[3])])
+        self.best_m = min(self.best_m, found_m)
 
     @torch.no_grad()
     def _picture(self) -> None:
@@ -249,8 +262,9 @@ def _append(path: Path, row: list[Any]) -> None:
         csv.writer(file).writerow(row)
 
 
-def _keep_rows(path: Path, columns: tuple[str, ...], step: int) -> None:
+def _keep_rows(path: Path, columns: tuple[str, ...], step: int) -> list[dict[str, str]]:
     """The head and the rows up to `step`: what a stopped run wrote after its checkpoint is written again."""
     lines = path.read_text(encoding="utf-8").splitlines()[1:] if path.exists() and step else []
     kept = [line for line in lines if int(line.split(",")[0]) <= step]
     path.write_text("\n".join([",".join(columns), *kept]) + "\n", encoding="utf-8")
+    return [dict(zip(columns, line.split(","), strict=False)) for line in kept]
