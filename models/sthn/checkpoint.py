@@ -1,7 +1,8 @@
 """Released checkpoints, loaded strictly: a missing or extra key, or a wrong shape, is an error that names it.
 
 Layouts:
-* a directory with `config.json` and `model.safetensors` (else `pytorch_model.bin`): flat keys `netG.*`, `netG_fine.*`;
+* a directory with `config.json` and `model.safetensors` (else `pytorch_model.bin`): flat keys `netG.*`, `netG_fine.*`.
+  One of `sthn.train` has the direction of the look-up, `lookup`, beside the released `model_config`;
 * a `.pth` file: `{"netG": {...}, "netG_fine": {...} or None}`, keys with or without `module.`. It states no
   configuration, so that the caller must.
 """
@@ -9,7 +10,9 @@ Layouts:
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors.torch import load_file
@@ -25,12 +28,13 @@ class CheckpointError(ValueError):
 
 
 def load_checkpoint(
-    path: str | Path, config: NetworkConfig | None = None, fine: str | Path | None = None, lookup: Lookup = Lookup.PUBLISHED
+    path: str | Path, config: NetworkConfig | None = None, fine: str | Path | None = None, lookup: Lookup | None = None
 ) -> Sthn:
     """Loads a released checkpoint, in evaluation mode.
 
     `config`: needed for a `.pth`; for a directory it replaces `config.json` (another padding, say).
     `fine`: a second `.pth` whose `netG` becomes the fine network (the authors' `--eval_model_fine`).
+    `lookup`: its direction, for weights that state none; the published one where nobody says.
     Files are read with `weights_only=True`: a pickle cannot run code.
     """
     path = Path(path)
@@ -45,9 +49,39 @@ def load_checkpoint(
         state = {key: value for key, value in state.items() if not key.startswith("netG_fine.")}
         other = _read_pth(Path(fine))
         state |= {f"netG_fine.{key.removeprefix('netG.')}": value for key, value in other.items() if key.startswith("netG.")}
-    network = Sthn(config, lookup)
+    stated = stated_lookup(path)
+    if None not in (lookup, stated) and lookup != stated:
+        raise CheckpointError(f"{path}: lookup: expected {stated.value}, as it was trained, found {lookup.value}")
+    network = Sthn(config, lookup or stated or Lookup.PUBLISHED)
     load_state(network, state, str(path))
     return network.eval()
+
+
+def read_experiment(path: Path) -> dict[str, Any] | None:
+    """`experiment.json` of the training that left a checkpoint (`RUN/best`, `RUN/final`, `RUN/STHN.pth`); None beside others."""
+    file = path.resolve().parent / "experiment.json"
+    return _read_json(file) if file.is_file() else None
+
+
+def stated_lookup(path: Path) -> Lookup | None:
+    """The direction that a checkpoint was trained with, of `config.json` or its training; released ones state none."""
+    config = _read_json(path / "config.json") if (path / "config.json").is_file() else {}
+    value = config.get("lookup") or ((read_experiment(path) or {}).get("network") or {}).get("lookup")
+    try:
+        return None if value is None else Lookup(value)
+    except ValueError:
+        known = " | ".join(direction.value for direction in Lookup)
+        raise CheckpointError(f"{path}: lookup: expected {known}, found {value!r}") from None
+
+
+def _read_json(file: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{file}: {error}") from error
+    if not isinstance(document, dict):
+        raise CheckpointError(f"{file}: expected a table, found {_describe(document)}")
+    return document
 
 
 def one_stage(network: Sthn) -> Sthn:

@@ -48,7 +48,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
     padding = PAPER_PADDING if options.padding is None else options.padding
     words = [str(options.checkpoint), "--out", str(options.out), "--name", options.name or options.out.name]
-    # Further words are the export's: --window, --levels, --fine, --one-stage, --search-radius-m, --licence, ...
+    # Further words are the export's: --window, --levels, --lookup, --fine, --one-stage, --search-radius-m, --licence, ...
     if code := export.main([*words, "--padding", str(padding), *more]):
         return code
     if (options.checkpoint / "expected.npz").is_file():

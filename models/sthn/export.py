@@ -29,7 +29,7 @@ from torch import Tensor, nn
 from . import pipeline, procedural
 from .bundle import Bundle, BundleError, golden_arrays, in_memory, write_bundle
 from .checkpoint import load_checkpoint, one_stage
-from .network import Matcher, NetworkConfig, Sthn
+from .network import Lookup, Matcher, NetworkConfig, Sthn
 from .parity import to_tensor
 
 OPSET = 17
@@ -245,6 +245,8 @@ def _arguments() -> argparse.ArgumentParser:
     parser.add_argument("--padding", type=int, help="on each side of the coarse box, m (default: the config's; 32 where none)")
     parser.add_argument("--window", type=int, help="W_S, m (default: the config's; 1536 where none)")
     parser.add_argument("--levels", type=int, help="correlation levels of the coarse stage; must be given for a .pth")
+    lookups = [direction.value for direction in Lookup]
+    parser.add_argument("--lookup", choices=lookups, help="that the weights were trained with, where the checkpoint states none")
     parser.add_argument("--search-radius-m", type=float, help="D_C (default: (W_S - 512) / 2, at least 50)")
     parser.add_argument("--coarse-sigma-m", type=float, default=PAPER_SIGMA_M["coarse"], help="1-sigma per axis (default: paper)")
     parser.add_argument("--refine-sigma-m", type=float, default=PAPER_SIGMA_M["refine"], help="1-sigma per axis (default: paper)")
@@ -285,7 +287,7 @@ def main(arguments: list[str] | None = None) -> int:
             network = procedural.network(config, options.random_weights)
             description = "The published architecture with weights made by formula: for tests and benchmarks, it locates nothing."
         else:
-            network = load_checkpoint(options.checkpoint, config, options.fine)
+            network = load_checkpoint(options.checkpoint, config, options.fine, options.lookup and Lookup(options.lookup))
             description = f"Released STHN checkpoint {options.checkpoint.name} (Xiao et al., RA-L 2024)."
         if options.one_stage:
             network = one_stage(network)

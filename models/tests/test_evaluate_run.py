@@ -198,6 +198,7 @@ def test_the_light_bundle_gives_its_golden_answer() -> None:
         ("bundle:", "nothing"),
         ("bundle:b,levels=4", "options stages"),
         ("checkpoint:c,levels=four", "with a number"),
+        ("checkpoint:c,lookup=inwards", r"lookup: expected published \| map_indexed \| frame_indexed, found inwards"),
         ("bundle:absent", "bundle.toml"),
         ("bundle:absent,stages=3", "expected 1 or 2"),
         ("checkpoint:absent.pth", "expected window, levels=N"),

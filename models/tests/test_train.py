@@ -16,7 +16,8 @@ from safetensors.torch import load_file
 
 from sthn.checkpoint import CheckpointError, load_checkpoint
 from sthn.data import DataError, Pair
-from sthn.network import NetworkConfig, Sthn, bounding_box
+from sthn.evaluate.methods import Spec
+from sthn.network import Lookup, NetworkConfig, Sthn, bounding_box
 from sthn.train import box, experiment, loop, saving
 from sthn.train.__main__ import main
 from sthn.train.experiment import BoxTable
@@ -237,6 +238,26 @@ def test_checkpoints_are_in_the_released_layouts_and_load_strictly(whole: Path) 
     with pytest.raises(CheckpointError, match="expected shape"):
         load_checkpoint(whole / "final", dataclasses.replace(TINY, corr_level=1))
     assert (whole / "pictures/step-00000004.jpg").stat().st_size > 1000
+
+
+def test_the_direction_of_the_look_up_goes_along(tmp_path: Path) -> None:
+    """A network of one direction is another one in the other: the folder, evaluation and the start of a training say it."""
+    network = Sthn(dataclasses.replace(TINY, two_stages=False), Lookup.FRAME_INDEXED)
+    saving.save_released(network, tmp_path / "best")
+    saving.save_pth({"netG": network.netG}, tmp_path / "bare.pth")
+    assert load_checkpoint(tmp_path / "best").netG.lookup is Lookup.FRAME_INDEXED
+    assert Spec.parse(f"checkpoint:{tmp_path}/best").open(50).network.netG.lookup is Lookup.FRAME_INDEXED
+    with pytest.raises(CheckpointError, match="lookup: expected frame_indexed, as it was trained, found published"):
+        load_checkpoint(tmp_path / "best", lookup=Lookup.PUBLISHED)
+    with pytest.raises(CheckpointError, match="lookup: expected published, found frame_indexed"):
+        saving.start_from(Sthn(TINY), tmp_path / "best")
+    assert load_checkpoint(tmp_path / "bare.pth", network.config).netG.lookup is Lookup.PUBLISHED
+    assert (
+        load_checkpoint(tmp_path / "bare.pth", network.config, lookup=Lookup.FRAME_INDEXED).netG.lookup.value == "frame_indexed"
+    )
+    assert Spec.parse("checkpoint:a.pth,window=64,lookup=frame_indexed").options["lookup"] is Lookup.FRAME_INDEXED
+    (tmp_path / "experiment.json").write_text('{"network": {"lookup": "map_indexed"}}')
+    assert load_checkpoint(tmp_path / "bare.pth", network.config).netG.lookup is Lookup.MAP_INDEXED, "beside its training"
 
 
 def test_two_stages_start_from_a_coarse_checkpoint(place: Path, whole: Path) -> None:

@@ -5,12 +5,13 @@ A method is named `[LABEL=]KIND:WHAT[,OPTION=VALUE ...]`:
     bundle:models/bundles/lite-1536
     "STHN 1536=checkpoint:STHN-two-stages,padding=32"       a released folder: config.json and model.safetensors
     "STHN 512=checkpoint:runs/dc{dc}.pth,window=512,levels=2"  a .pth states neither window nor levels
+    checkpoint:mine.pth,window=512,levels=2,lookup=frame_indexed   nor, away from its run, how it looks up (default: as published)
     rival:sift+magsac        rival:dhn@runs/dhn,window=512
 
 `rival:all` is every rival that is not named by itself: all of Tables I and II. `{dc}` in a path becomes the D_C of each
-condition: the paper trains a network for each. Options: `window`, `levels`, `padding`, `stages` (1: the coarse stage alone)
-of a checkpoint, `stages` of a bundle, `window` of a rival (metres, 512 by default). Networks take pixels: at another scale
-than 1 m/px (low flights) the same pixels are another ground.
+condition: the paper trains a network for each. Options: `window`, `levels`, `padding`, `lookup`, `stages` (1: the coarse
+stage alone) of a checkpoint, `stages` of a bundle, `window` of a rival (metres, 512 by default). Networks take pixels: at
+another scale than 1 m/px (low flights) the same pixels are another ground.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import dataclasses
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,7 +30,7 @@ from .. import correlate, geometry, pipeline, rivals
 from ..bundle import Bundle, BundleError, read_bundle
 from ..checkpoint import load_checkpoint, one_stage
 from ..data.pair import FRAME_PX, Pair
-from ..network import NetworkConfig, Sthn
+from ..network import Lookup, NetworkConfig, Sthn
 from ..parity import to_tensor
 from ..rivals.base import Match, Rival
 
@@ -36,7 +38,8 @@ RIVAL_WINDOW_M = 512
 """W_S of the rivals in Table I."""
 
 KINDS = ("bundle", "checkpoint", "rival")
-OPTIONS = {"bundle": ("stages",), "checkpoint": ("window", "levels", "padding", "stages"), "rival": ("window",)}
+OPTIONS = {"bundle": ("stages",), "checkpoint": ("window", "levels", "padding", "stages", "lookup"), "rival": ("window",)}
+LOOKUPS = tuple(direction.value for direction in Lookup)
 
 
 class MethodError(ValueError):
@@ -59,7 +62,7 @@ class Spec:
     label: str
     kind: str
     what: str
-    options: dict[str, int] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
     def parse(cls, text: str) -> Spec:
@@ -69,9 +72,14 @@ class Spec:
         if not colon or kind not in KINDS:
             raise MethodError(f"method: expected [LABEL=]KIND:WHAT with KIND one of {', '.join(KINDS)}, found {text}")
         what, *given = rest.split(",")
-        options: dict[str, int] = {}
+        options: dict[str, Any] = {}
         for word in given:
             name, _, value = word.partition("=")
+            if kind == "checkpoint" and name == "lookup":
+                if value not in LOOKUPS:
+                    raise MethodError(f"{text}: lookup: expected {' | '.join(LOOKUPS)}, found {value}")
+                options[name] = Lookup(value)
+                continue
             if name not in OPTIONS[kind] or not value.isdecimal():
                 raise MethodError(f"{text}: expected {kind} options {', '.join(OPTIONS[kind])} with a number, found {word}")
             options[name] = int(value)
@@ -251,7 +259,7 @@ def stages_s(match: Match) -> dict[str, float]:
     return {k.removesuffix("_s"): float(v) for k, v in match.detail.items() if k.endswith("_s") and not isinstance(v, str)}
 
 
-def _load(path: Path, options: dict[str, int]) -> Sthn:
+def _load(path: Path, options: dict[str, Any]) -> Sthn:
     changes = {
         "database_size": options.get("window"),
         "corr_level": options.get("levels"),
@@ -259,14 +267,14 @@ def _load(path: Path, options: dict[str, int]) -> Sthn:
     }
     given = {name: value for name, value in changes.items() if value is not None}
     if path.is_dir():
-        network = load_checkpoint(path, dataclasses.replace(NetworkConfig.read(path / "config.json"), **given))
+        config = dataclasses.replace(NetworkConfig.read(path / "config.json"), **given)
     else:
         if missing := [name for name, key in (("window", "database_size"), ("levels", "corr_level")) if key not in given]:
             raise MethodError(f"{path}: a .pth file states no configuration: expected {', '.join(missing)}=N, found none")
         document = torch.load(path, map_location="cpu", weights_only=True)
         two = isinstance(document, dict) and document.get("netG_fine") is not None
         config = NetworkConfig(resize_width=256, iters_lev0=6, iters_lev1=6, two_stages=two, **({"fine_padding": 32} | given))
-        network = load_checkpoint(path, config)
+    network = load_checkpoint(path, config, lookup=options.get("lookup"))
     if options.get("stages") == 2 and network.netG_fine is None:
         raise MethodError(f"{path}: stages: expected a fine network (netG_fine), found none")
     return one_stage(network) if options.get("stages") == 1 else network
@@ -296,7 +304,7 @@ class _Renamed:
         return self.rival.match(pair)
 
 
-def _rival(what: str, label: str, options: dict[str, int]) -> Rival:
+def _rival(what: str, label: str, options: dict[str, Any]) -> Rival:
     name, _, path = what.partition("@")
     paths = {rivals.registry.keyword(name): path} if path else {}
     (rival,) = rivals.available([name], **paths)

@@ -7,6 +7,8 @@ RUN/STHN.pth                        {"netG", "netG_fine"}, the authors' other la
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +16,15 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from ..checkpoint import CheckpointError, load_state, read_state
+from ..checkpoint import CheckpointError, load_state, read_state, stated_lookup
 from ..network import Sthn
 
 
 def save_released(network: Sthn, folder: Path) -> None:
-    """The directory layout of a released checkpoint."""
+    """The directory layout of a released checkpoint, and the direction of the look-up."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "config.json").write_text(network.config.to_json() + "\n", encoding="utf-8")
+    config = {"model_config": dataclasses.asdict(network.config), "lookup": network.netG.lookup.value}
+    (folder / "config.json").write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
     state = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
     save_file(state, str(folder / "model.safetensors"))
 
@@ -35,6 +38,8 @@ def save_pth(nets: dict[str, nn.Module], path: Path) -> None:
 def start_from(network: Sthn, path: Path) -> None:
     """Weights of a checkpoint as a start: all of them, or the coarse ones for a network with a new fine stage. Strict:
     every key of the stages that the checkpoint holds."""
+    if (stated := stated_lookup(path)) not in (None, network.netG.lookup):
+        raise CheckpointError(f"{path}: lookup: expected {network.netG.lookup.value}, found {stated.value}")
     state = read_state(path)
     if network.netG_fine is not None and not any(key.startswith("netG_fine.") for key in state):
         state |= {key: value for key, value in network.state_dict().items() if key.startswith("netG_fine.")}
