@@ -1,17 +1,19 @@
 """Does a survey foretell? Its coverage by cell against that of a flight on another night.
 
     python -m sthn.integrity.survey_check --survey target/survey --map ../shared/data/maps/demo/dubai_t3.tif \
-        --bundle models/bundles/lite-1536 --nightfix target/release/nightfix --seed 77
+        --bundle models/bundles/lite-1536 --nightfix target/release/nightfix --seed 77 \
+        --table models/reports/survey/dubai_t3.csv
 
 Flies a random flight over the map (`--seed` must not be the survey's), replays it, and puts every frame into its cell. Prints
 JSON: mean absolute difference over cells with frames of both, their correlation, and the coverage measured over cells by what
 was foretold. What is flown over a cell is few frames: with n of them a coverage has a standard error of up to 0.5 / sqrt(n),
-which is printed beside.
+which is printed beside. `--table` keeps every cell: its place, what was foretold, what was measured, over how many frames.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import math
 from pathlib import Path
@@ -20,7 +22,7 @@ import numpy as np
 import pyproj
 import rasterio
 
-from .trials import call
+from .trials import call, whole_command
 
 CLASSES = ((0.0, 0.25), (0.25, 0.75), (0.75, 1.01))
 """Foretold coverage, from and below."""
@@ -48,21 +50,42 @@ def fly(args: argparse.Namespace) -> list[dict]:
     ]
 
 
-def compare(survey: Path, lines: list[dict]) -> dict:
-    """Foretold against measured, by cell."""
+def cells_of(survey: Path, lines: list[dict]) -> list[dict]:
+    """Surveyed cells that were flown over, north to south, west to east: foretold and measured coverage, frames."""
     with rasterio.open(survey / "survey.tif") as file:
-        foretold, to_cell = file.read(1), ~file.transform
+        foretold, of_cell = file.read(1), file.transform
         to_map = pyproj.Transformer.from_crs(4326, file.crs, always_xy=True)
+    to_cell = ~of_cell
     cells: dict[tuple[int, int], list[bool]] = {}
     for line in lines:
-        column, row = (math.floor(v) for v in to_cell * to_map.transform(*line["at"]))
+        column, row = (math.floor(v) for v in to_cell @ to_map.transform(*line["at"]))
         cells.setdefault((row, column), []).append(line["status"] == "fix")
-    shared = [(float(foretold[cell]), found) for cell, found in cells.items() if np.isfinite(foretold[cell])]
-    if not shared:
+    rows = []
+    for (row, column), found in sorted(cells.items()):
+        inside = 0 <= row < foretold.shape[0] and 0 <= column < foretold.shape[1]
+        if not inside or not np.isfinite(foretold[row, column]):
+            continue
+        lon, lat = to_map.transform(*(of_cell @ (column + 0.5, row + 0.5)), direction="INVERSE")
+        coverage = {"foretold": float(foretold[row, column]), "measured": float(np.mean(found)), "frames": len(found)}
+        rows.append({"row": row, "column": column, "lat_deg": lat, "lon_deg": lon} | coverage)
+    if not rows:
         raise SystemExit("expected frames over surveyed cells, found none")
-    said = np.array([said for said, _ in shared])
-    seen = np.array([np.mean(found) for _, found in shared])
-    count = np.array([len(found) for _, found in shared])
+    return rows
+
+
+def write_cells(cells: list[dict], path: Path) -> None:
+    """CSV, a row per cell."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(cells[0])
+        for cell in cells:
+            writer.writerow(f"{value:.6f}" if isinstance(value, float) else value for value in cell.values())
+
+
+def compare(cells: list[dict]) -> dict:
+    """Foretold against measured, over all cells."""
+    said, seen, count = (np.array([cell[name] for cell in cells]) for name in ("foretold", "measured", "frames"))
     classes = {}
     for low, high in CLASSES:
         here = (said >= low) & (said < high)
@@ -75,7 +98,7 @@ def compare(survey: Path, lines: list[dict]) -> dict:
         }
     constant = len(set(said)) == 1 or len(set(seen)) == 1
     return {
-        "cells": len(shared),
+        "cells": len(cells),
         "frames": int(count.sum()),
         "foretold": float((said * count).sum() / count.sum()),
         "measured": float((seen * count).sum() / count.sum()),
@@ -97,8 +120,12 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--work", type=Path, default=Path("target/integrity/survey"))
     parser.add_argument("--seed", type=int, default=77)
     parser.add_argument("--frames", type=int, default=100)
+    parser.add_argument("--table", type=Path, help="CSV: a row per cell")
     args = parser.parse_args(words)
-    print(json.dumps(compare(args.survey, fly(args)), indent=2))
+    cells = cells_of(args.survey, fly(args))
+    if args.table:
+        write_cells(cells, args.table)
+    print(json.dumps({"command": whole_command(parser, args)} | compare(cells), indent=2))
 
 
 if __name__ == "__main__":

@@ -4,8 +4,9 @@
         --out target/integrity/calibration.csv
 
 A plan names flights (`PLANS`): which map, which noise, which D_C, how many frames, and what is done to the frames. Every
-plan is seeded; a flight or a replay that is there, and newer than what it is made of, is not made again. The table has a row
-per frame: flight, category, error, stated radius, status, reason and every number of the evidence.
+plan is seeded; a flight that was made of the same plan, and a replay newer than what it is made of, are not made again. The
+table has a row per frame: flight, map, category, error, stated radius, status, reason and every number of the evidence. Beside
+it `<out>.command` keeps the command that made it, for the reports.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import argparse
 import csv
 import json
 import math
+import shlex
 import shutil
 import subprocess
 import sys
@@ -35,8 +37,8 @@ OPEN_WATER_SHARE = 0.99
 REPORT_ERRORS = {"tilt_deg": 0.5, "map_m": 1.0, "stamp_m": 0.5}
 """Errors of a `stated` flight, 1-sigma per axis: what the default error budget states (`config/nightfix.toml`)."""
 
-WATER_PLACES = 20
-"""Priors that each frame over open water is tried with."""
+WATER_PLACES = 21
+"""Priors that each frame over open water is tried with: as many at each radius of `RADII`."""
 
 FRAME_HEIGHT, FRAME_WIDTH = 512, 640
 
@@ -59,6 +61,9 @@ class Flight:
     stated: bool = False
     """Whether attitude, map and time stamps are wrong by what the budget states; else they are exact, and the error is
     that of the match alone."""
+    sigma_prior: bool = False
+    """Whether the priors state a sigma of `radius_m` / 3 (the same disc) in place of the radius: then `prior_chi2` is in the
+    evidence."""
     words: tuple[str, ...] = ("--attitude-noise-deg", "2", "--report-attitude")
 
     def simulate_words(self, maps: Path) -> list[str]:
@@ -84,26 +89,33 @@ T1, T3 = "demo/dubai_t1.tif", "demo/dubai_t3.tif"
 RADII = (64.0, 256.0, 512.0)
 
 
-def localisable(prefix: str, maps: tuple[str, ...], seed: int, frames: int, stated: bool = False) -> list[Flight]:
-    """Flights over every map at every radius, half of them with the harder noise."""
+def localisable(prefix: str, maps: tuple[str, ...], seed: int, frames: int, **more: bool) -> list[Flight]:
+    """Flights over every map at every radius, half of them with the harder noise; `more` goes to each flight."""
     flights = []
     for i, source in enumerate(maps):
         for j, radius_m in enumerate(RADII):
             hard = (i + j) % 2 == 1
             noise = (10.0, 0.1) if hard else (5.0, 0.05)
             name = f"{prefix}-{i}-{radius_m:.0f}"
-            flights.append(Flight(name, source, seed + 10 * i + j, frames, radius_m, *noise, stated=stated))
+            flights.append(Flight(name, source, seed + 10 * i + j, frames, radius_m, *noise, **more))
     return flights
 
 
-def negatives(prefix: str, place: str, other: str, seed: int, frames: int) -> list[Flight]:
-    """What must not be placed: frames of another place, and frames that are none."""
-    base = Flight(f"{prefix}-elsewhere", other, seed, frames, over=place, category="another place")
+def negatives(prefix: str, place: str, other: str, seed: int, frames: int, sigma_prior: bool = False) -> list[Flight]:
+    """What must not be placed: frames of another place, and frames that are none. Of each kind `frames`, in equal parts at
+    every radius."""
     kinds = ("blank", "shutter", "noise", "hituav")
-    return [base] + [
-        replace(base, name=f"{prefix}-{kind}", source=place, over="", seed=seed + 1 + i, category=kind)
-        for i, kind in enumerate(kinds)
-    ]
+    flights = []
+    for j, radius_m in enumerate(RADII):
+        count = frames // len(RADII) + (j < frames % len(RADII))
+        at, end = seed + (1 + len(kinds)) * j, f"{radius_m:.0f}"
+        base = Flight(f"{prefix}-elsewhere-{end}", other, at, count, radius_m, sigma_prior=sigma_prior)
+        flights.append(replace(base, over=place, category="another place"))
+        flights += [
+            replace(base, name=f"{prefix}-{kind}-{end}", source=place, seed=at + 1 + i, category=kind)
+            for i, kind in enumerate(kinds)
+        ]
+    return flights
 
 
 PLANS: dict[str, list[Flight]] = {
@@ -114,12 +126,26 @@ PLANS: dict[str, list[Flight]] = {
     ],
     "test": [
         *localisable("test", (T1, T3, "world:301", "world:302"), 2000, 100, stated=True),
-        *localisable("exact", (T1, T3, "world:301", "world:302"), 2300, 25),
+        # Half of what belongs nowhere states a sigma too: of the `exact` flights alone hardly any answer is wrong.
+        *localisable("exact", (T1, T3, "world:301", "world:302"), 2300, 25, sigma_prior=True),
         *negatives("test", T1, BERKELEY, 2100, 150),
-        *negatives("testb", T3, T4, 2120, 150),
+        *negatives("testb", T3, T4, 2120, 150, sigma_prior=True),
         Flight("test-water", T3, 2200, 400, category="open water"),
     ],
 }
+
+
+def whole_command(parser: argparse.ArgumentParser, args: argparse.Namespace) -> str:
+    """The command with every option that has a value, defaults too: what a report says it was made by."""
+    words = ["python", "-m", parser.prog]
+    for action in parser._actions:
+        value = getattr(args, action.dest, None)
+        if not action.option_strings or value is None or value is False:
+            continue
+        words.append(action.option_strings[-1])
+        if value is not True:
+            words += [f"{v:g}" if isinstance(v, float) else str(v) for v in (value if isinstance(value, list) else [value])]
+    return shlex.join(words)
 
 
 def call(words: list[str], allowed: tuple[int, ...] = (0,)) -> None:
@@ -166,7 +192,7 @@ def run(flight: Flight, args: argparse.Namespace) -> list[dict]:
     """Makes and replays a flight; its rows."""
     folder = args.work / flight.name
     done = folder / "done"
-    if not done.exists():
+    if not done.exists() or done.read_text() != repr(flight):
         if folder.exists():
             shutil.rmtree(folder)
         call([str(args.nightfix), "simulate", "--out", str(folder), *flight.simulate_words(args.maps)])
@@ -176,9 +202,11 @@ def run(flight: Flight, args: argparse.Namespace) -> list[dict]:
             keep_water(folder, flight)
         if flight.over:
             relocate(folder, args.maps / flight.over if ":" not in flight.over else None, flight.seed, args)
+        if flight.sigma_prior:
+            state_sigma(folder, flight)
         if flight.stated:
             state_errors(folder, flight.seed)
-        done.touch()
+        done.write_text(repr(flight))
     kind = flight.source.partition(":")[0]
     map_path = args.maps / (flight.over or flight.source) if kind != "world" or flight.over else folder / "world.tif"
     out = folder / f"replay-{args.bundle.name}"
@@ -231,12 +259,33 @@ def rewrite(folder: Path, change) -> None:
     """Replaces the rows of `poses.csv` by `change(rows)`."""
     with (folder / "poses.csv").open() as file:
         rows = list(csv.DictReader(file))
-    names = list(rows[0])
     rows = change(rows)
+    names = list(dict.fromkeys(name for row in rows for name in row))
     with (folder / "poses.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, names)
         writer.writeheader()
         writer.writerows(rows)
+
+
+def state_sigma(folder: Path, flight: Flight) -> None:
+    """Priors that state a sigma: drawn as a Gaussian about the truth, again where the disc of 3 sigma would not hold it (1.1 %:
+    such a frame is not to be found). Priors over another place stay where they are."""
+    geod, rng, sigma_m = pyproj.Geod(ellps="WGS84"), np.random.default_rng([flight.seed, 8]), flight.radius_m / 3
+
+    def change(rows: list[dict]) -> list[dict]:
+        for row in rows:
+            row |= {"prior_sigma_m": repr(sigma_m), "prior_radius_m": ""}
+            off = rng.normal(0, sigma_m, 2)
+            while np.hypot(*off) >= 3 * sigma_m:
+                off = rng.normal(0, sigma_m, 2)
+            if flight.over:
+                continue
+            at = float(row["truth_lon_deg"]), float(row["truth_lat_deg"])
+            lon, lat, _ = geod.fwd(*at, math.degrees(math.atan2(off[0], off[1])), float(np.hypot(*off)))
+            row |= {"prior_lat_deg": f"{lat:.9f}", "prior_lon_deg": f"{lon:.9f}"}
+        return rows
+
+    rewrite(folder, change)
 
 
 def state_errors(folder: Path, seed: int) -> None:
@@ -258,7 +307,8 @@ def state_errors(folder: Path, seed: int) -> None:
 
 
 def keep_water(folder: Path, flight: Flight) -> None:
-    """Keeps the rows over open water, each with several priors drawn from the disc: as many frame-and-place trials."""
+    """Keeps the rows over open water, each with several priors drawn from discs of every radius: as many frame-and-place
+    trials."""
     geod, rng = pyproj.Geod(ellps="WGS84"), np.random.default_rng(flight.seed)
     with (folder / "truth.csv").open() as file:
         water = {row["file"] for row in csv.DictReader(file) if float(row["water_share"]) > OPEN_WATER_SHARE}
@@ -270,9 +320,11 @@ def keep_water(folder: Path, flight: Flight) -> None:
         again = []
         for i, row in ((i, row) for i in range(WATER_PLACES) for row in over):
             lon, lat = float(row["truth_lon_deg"]), float(row["truth_lat_deg"])
-            lon, lat, _ = geod.fwd(lon, lat, rng.uniform(0, 360), flight.radius_m * math.sqrt(rng.random()))
+            radius_m = RADII[i % len(RADII)]
+            lon, lat, _ = geod.fwd(lon, lat, rng.uniform(0, 360), radius_m * math.sqrt(rng.random()))
             stamp = int(row["stamp_ns"]) + i * 10_000_000_000_000
-            again.append(row | {"prior_lat_deg": f"{lat:.8f}", "prior_lon_deg": f"{lon:.8f}", "stamp_ns": str(stamp)})
+            prior = {"prior_lat_deg": f"{lat:.8f}", "prior_lon_deg": f"{lon:.8f}", "prior_radius_m": str(radius_m)}
+            again.append(row | prior | {"stamp_ns": str(stamp)})
         return again
 
     rewrite(folder, change)
@@ -292,8 +344,9 @@ def read(flight: Flight, folder: Path, out: Path) -> list[dict]:
         row = {
             "flight": flight.name,
             "file": fix["file"],
+            "map": flight.over or flight.source,
             "category": category,
-            "radius_m": flight.radius_m,
+            "radius_m": round(fix.get("prior", {}).get("radius_m", flight.radius_m), 3),
             "water_share": water,
             "status": fix["status"],
             "reason": fix.get("reason") or fix.get("withheld", ""),
@@ -336,6 +389,7 @@ def main(words: list[str] | None = None) -> None:
     for flight in tqdm(flights, file=sys.stderr):
         rows += run(flight, args)
     write_table(rows, args.out)
+    args.out.with_suffix(".command").write_text(whole_command(parser, args) + "\n")
     print(f"{args.out}: {len(rows)} frames of {len(flights)} flights")
 
 
