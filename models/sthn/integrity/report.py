@@ -4,13 +4,15 @@
         --out models/reports/integrity
 
 The trials have an answer for every frame, with the reason for which the gates would have withheld it: what has none is what
-the service publishes. Writes README.md, numbers.json and two pictures.
+the service publishes. Trials that belong nowhere count at the D_C at which they were searched. Writes README.md, numbers.json
+and two pictures.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import tomllib
 from pathlib import Path
 
@@ -18,12 +20,13 @@ import numpy as np
 from scipy.stats import beta
 
 from . import model
-from .fit import BOUND_M, CUES, evidence_of, read_trials
+from .fit import BOUND_M, CUES, OWN, OWN_SHARE, evidence_of, read_trials, trial_weight
+from .trials import RADII, whole_command
 
 FALLING = ("peak_mass", "peak_logit", "cycle_mass", "refine_weight", "gradient_agreement", "quad_side_ratio", "frame_smoothness")
 """Cues that are high where the match is right."""
-ALONE = (*CUES, "quad_scale_error", "quad_turn_deg", "prior_distance_share", "frame_texture", "map_texture")
-"""Cues that are measured alone."""
+ALONE = (*CUES, "quad_scale_error", "quad_turn_deg", "prior_distance_share", "prior_chi2", "frame_texture", "map_texture")
+"""Cues that are measured alone. `prior_chi2` is there where the prior states a sigma: `sigma_prior` of a plan."""
 RISING_TEXTURES = ("frame_texture", "map_texture")
 CALIBRATION_BINS = 10
 MIN_TEXTURE = 5.0
@@ -46,27 +49,28 @@ def roc(score: np.ndarray, wrong: np.ndarray) -> tuple[np.ndarray, np.ndarray, f
     return fpr, tpr, float(np.trapezoid(tpr, fpr))
 
 
-def cue_table(trials: dict[str, np.ndarray]) -> dict[str, dict[str, float]]:
-    """Area under the curve of every cue alone, by D_C; frames over places where they belong, and all trials."""
+Curve = tuple[np.ndarray, np.ndarray, float]
+
+
+def cue_curves(trials: dict[str, np.ndarray]) -> dict[str, dict[str, Curve]]:
+    """The curve of every cue alone, by D_C: whatever was searched at that D_C, frames that belong nowhere too (wrong places in
+    the window itself are too few to draw a curve); and over frames over their own place alone."""
     evidence = evidence_of(trials)
     wrong = ~(trials["error_m"] <= BOUND_M)
     answered = trials["status"] == "fix"
-    found: dict[str, dict[str, float]] = {}
+    parts = {f"{radius_m:.0f}": trials["radius_m"] == radius_m for radius_m in RADII}
+    parts["own place only"] = np.isin(trials["category"], OWN)
+    found: dict[str, dict[str, Curve]] = {}
     for name in ALONE:
         if name not in evidence:
             continue
         sign = -1.0 if name in FALLING or name in RISING_TEXTURES else 1.0
         usable = answered & np.isfinite(evidence[name])
-        row = {}
-        for radius_m in (64.0, 256.0, 512.0):
-            # Wrong places in the window itself are too few to draw a curve: frames of other places stand beside them.
-            here = usable & ((trials["radius_m"] == radius_m) | np.isin(trials["category"], NEGATIVE))
+        found[name] = {}
+        for part, of in parts.items():
+            here = usable & of
             if wrong[here].any() and not wrong[here].all():
-                row[f"{radius_m:.0f}"] = roc(sign * evidence[name][here], wrong[here])[2]
-        here = usable & np.isin(trials["category"], ("localisable", "water"))
-        if wrong[here].any() and not wrong[here].all():
-            row["own place only"] = roc(sign * evidence[name][here], wrong[here])[2]
-        found[name] = row
+                found[name][part] = roc(sign * evidence[name][here], wrong[here])
     return found
 
 
@@ -84,12 +88,16 @@ def consistency(error_m: np.ndarray, sigma_m: np.ndarray, radius95_m: np.ndarray
     }
 
 
-def calibration_bins(p: np.ndarray, wrong: np.ndarray) -> list[dict]:
-    """Stated against found in bins of as many trials each, by the stated probability."""
+def calibration_bins(p: np.ndarray, wrong: np.ndarray, weight: np.ndarray) -> list[dict]:
+    """Stated against found in bins of as much weight each, by the stated probability."""
     bins = []
     order = np.argsort(p, kind="stable")
-    for part in np.array_split(order, CALIBRATION_BINS):
-        bins.append({"trials": len(part), "stated": float(p[part].mean()), "found": float(wrong[part].mean())})
+    cumulated = np.cumsum(weight[order]) / weight.sum()
+    which = np.minimum((cumulated - 0.5 * weight[order] / weight.sum()) * CALIBRATION_BINS, CALIBRATION_BINS - 1).astype(int)
+    for part in (order[which == i] for i in range(CALIBRATION_BINS)):
+        if len(part):
+            stated, found = (float(np.average(column[part], weights=weight[part])) for column in (p, wrong))
+            bins.append({"trials": len(part), "stated": stated, "found": found})
     return bins
 
 
@@ -101,11 +109,14 @@ def measure(off: dict[str, np.ndarray], bundle: Path) -> dict:
     p = np.full(len(usable), 1.0)
     p[usable], sigma = model.judge(table, {name: column[usable] for name, column in evidence.items()})
     wrong = ~(off["error_m"] <= BOUND_M)
-    own = np.isin(off["category"], ("localisable", "water"))
-    numbers: dict = {"bundle": bundle.name, "fitted_on": table["data"], "bound_m": BOUND_M, "cues": cue_table(off)}
+    own = np.isin(off["category"], OWN)
+    numbers: dict = {"bundle": bundle.name, "fitted_on": table["data"], "bound_m": BOUND_M}
+    numbers["cues"] = {name: {part: curve[2] for part, curve in row.items()} for name, row in cue_curves(off).items()}
+    weight, even = trial_weight(off["category"][usable]), np.ones(len(usable))
     numbers["calibration"] = {
-        "all trials": calibration_bins(p[usable], wrong[usable]),
-        "own place only": calibration_bins(p[usable & own], wrong[usable & own]),
+        f"all trials, own place {100 * OWN_SHARE:.0f} % of the weight": calibration_bins(p[usable], wrong[usable], weight),
+        "own place only": calibration_bins(p[usable & own], wrong[usable & own], even[usable & own]),
+        "all trials, each the same weight": calibration_bins(p[usable], wrong[usable], even[usable]),
     }
     match = usable & own & ~wrong & (p <= 0.1) & np.char.startswith(off["flight"], "exact")
     if match.any():
@@ -123,7 +134,7 @@ def measure(off: dict[str, np.ndarray], bundle: Path) -> dict:
     localisable = (on["category"] == "localisable") & ((texture >= MIN_TEXTURE) | ~np.isfinite(texture))
     fixed = (on["status"] == "fix") & (on["reason"] == "")
     accepted = localisable & fixed
-    service = own_fixes(on, fixed & np.isin(on["category"], ("localisable", "water")))
+    service = own_fixes(on, fixed & np.isin(on["category"], OWN))
     beyond = int((on["error_m"][accepted] > 50).sum())
     numbers["service"] = service | {
         "localisable_frames": int(localisable.sum()),
@@ -133,7 +144,7 @@ def measure(off: dict[str, np.ndarray], bundle: Path) -> dict:
         "accepted_over_50m_upper_bound": upper_bound(beyond, int(accepted.sum())),
         "by_radius_m": {
             f"{r:.0f}": float((accepted & (on["radius_m"] == r)).sum() / max(1, (localisable & (on["radius_m"] == r)).sum()))
-            for r in (64.0, 256.0, 512.0)
+            for r in RADII
         },
         "no_fix_reasons": dict(
             zip(*[a.tolist() for a in np.unique(on["reason"][localisable & ~fixed], return_counts=True)], strict=True)
@@ -184,26 +195,32 @@ def pictures(off: dict[str, np.ndarray], numbers: dict, out: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    evidence, wrong = evidence_of(off), ~(off["error_m"] <= BOUND_M)
-    figure, axes = plt.subplots(1, 3, figsize=(13, 4.6), sharey=True)
-    for axis, radius_m in zip(axes, (64.0, 256.0, 512.0), strict=True):
-        best = sorted(numbers["cues"], key=lambda n: -numbers["cues"][n].get(f"{radius_m:.0f}", 0))[:7]
-        for name in best:
-            usable = (off["status"] == "fix") & np.isfinite(evidence[name])
-            here = usable & ((off["radius_m"] == radius_m) | np.isin(off["category"], NEGATIVE))
-            sign = -1.0 if name in FALLING or name in RISING_TEXTURES else 1.0
-            fpr, tpr, area = roc(sign * evidence[name][here], wrong[here])
-            axis.plot(fpr, tpr, label=f"{name} {area:.3f}")
-        axis.set(title=f"D_C = {radius_m:.0f} m", xlabel="right answers refused", xlim=(0, 0.5))
-        axis.legend(fontsize=7, loc="lower right")
+    curves = cue_curves(off)
+    names = sorted(curves, key=lambda name: -numbers["cues"][name].get("512", 0))
+    columns = 5
+    size = (2.6 * columns, 2.5 * math.ceil(len(names) / columns))
+    figure, axes = plt.subplots(math.ceil(len(names) / columns), columns, figsize=size, sharex=True, sharey=True, squeeze=False)
+    for axis, name in zip(axes.flat, names, strict=False):
+        for radius_m in RADII:
+            if f"{radius_m:.0f}" in curves[name]:
+                fpr, tpr, area = curves[name][f"{radius_m:.0f}"]
+                axis.plot(fpr, tpr, linewidth=1, label=f"{radius_m:.0f} m: {area:.3f}")
+        axis.plot([0, 1], [0, 1], color="0.8", linewidth=0.8)
+        axis.set_title(name, fontsize=9)
+        axis.legend(fontsize=6, loc="lower right")
         axis.grid(alpha=0.3)
-    axes[0].set_ylabel("wrong answers found")
+    for axis in list(axes.flat)[len(names) :]:
+        axis.set_visible(False)
+    figure.supxlabel("right answers refused", fontsize=10)
+    figure.supylabel("wrong answers found", fontsize=10)
     figure.tight_layout()
-    figure.savefig(out / "cues.jpg", dpi=80)
+    figure.savefig(out / "cues.jpg", dpi=70)
+    plt.close(figure)
     figure, axes = plt.subplots(1, 2, figsize=(10, 4.2))
-    bins = numbers["calibration"]["all trials"]
     axes[0].plot([0, 1], [0, 1], color="0.7")
-    axes[0].plot([b["stated"] for b in bins], [b["found"] for b in bins], "o-")
+    for name, bins in numbers["calibration"].items():
+        axes[0].plot([b["stated"] for b in bins], [b["found"] for b in bins], "o-", markersize=4, label=name)
+    axes[0].legend(fontsize=7)
     axes[0].set(title="P(error > 25 m)", xlabel="stated", ylabel="found")
     axes[1].plot([r["coverage"] for r in numbers["risk_coverage"]], [r["risk_over_25m"] for r in numbers["risk_coverage"]], "o-")
     axes[1].set(title="own place, gates off", xlabel="coverage", ylabel="share above 25 m")
@@ -211,12 +228,14 @@ def pictures(off: dict[str, np.ndarray], numbers: dict, out: Path) -> None:
         axis.grid(alpha=0.3)
     figure.tight_layout()
     figure.savefig(out / "calibration.jpg", dpi=80)
+    plt.close(figure)
 
 
-def text(numbers: dict, command: str) -> str:
+def text(numbers: dict, commands: list[str]) -> str:
     """The report."""
     service = numbers["service"]
-    lines = ["# Integrity of " + numbers["bundle"], "", f"`{command}`", ""]
+    lines = ["# Integrity of " + numbers["bundle"], ""]
+    lines += [line for command in commands for line in (f"`{command}`", "")]
     lines += [f"Fitted on: {numbers['fitted_on']}. Tested on maps that neither training nor the fit saw.", ""]
     lines += ["## What the service states, and what it makes", ""]
     rows = [("the whole stated error", service)]
@@ -261,19 +280,29 @@ def text(numbers: dict, command: str) -> str:
         "",
         "## P(error > 25 m): stated and found",
         "",
+        f"The probability is that of a frame in a flight of which {100 * OWN_SHARE:.0f} % of the frames are over the place that "
+        "the prior says (water too), the others elsewhere or of nothing. In another mixture another share is found where the "
+        "evidence leaves a doubt.",
+        "",
         "| trials | stated | found | |",
         "|---|---|---|---|",
     ]
     for name, bins in numbers["calibration"].items():
         lines += [f"| {b['trials']} | {b['stated']:.4f} | {b['found']:.4f} | {name} |" for b in bins]
+    gaps = {name: max(abs(b["stated"] - b["found"]) for b in bins) for name, bins in numbers["calibration"].items()}
+    lines += ["", "Largest gap of a bin, in points: " + ", ".join(f"{name} {100 * gap:.1f}" for name, gap in gaps.items()) + "."]
     lines += ["", "![calibration, risk and coverage](calibration.jpg)", "", "## Each cue alone", ""]
-    lines += ['Area under the curve of "error above 25 m" (0.5 is chance). By D_C: frames over their own place at that D_C and']
-    lines += ["frames that belong nowhere; last column: own place only, water included.", ""]
+    lines += ['Area under the curve of "error above 25 m" (0.5 is chance). By D_C: frames over their own place and']
+    lines += ["frames that belong nowhere, both searched at that D_C; last column: own place only, water included."]
+    lines += [
+        "`prior_chi2` is evidence of priors that state a sigma, not of those that state a radius: part of the trials do.",
+        "",
+    ]
     lines += ["| cue | 64 m | 256 m | 512 m | own place only |", "|---|---|---|---|---|"]
     columns = ("64", "256", "512", "own place only")
     for name, row in sorted(numbers["cues"].items(), key=lambda item: -item[1].get("512", 0)):
         lines.append(f"| `{name}` | " + " | ".join(f"{row[c]:.3f}" if c in row else "-" for c in columns) + " |")
-    return "\n".join([*lines, "", "![curves of the best cues](cues.jpg)", ""])
+    return "\n".join([*lines, "", "![curves of every cue](cues.jpg)", ""])
 
 
 def main(words: list[str] | None = None) -> None:
@@ -288,10 +317,11 @@ def main(words: list[str] | None = None) -> None:
     numbers = measure(trials, args.bundle)
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "numbers.json").write_text(json.dumps(numbers, indent=1) + "\n")
-    command = f"python -m sthn.integrity.report --trials {args.trials} --bundle {args.bundle} --out {args.out}"
-    (args.out / "README.md").write_text(text(numbers, command))
+    made_by = args.trials.with_suffix(".command")
+    commands = [*([made_by.read_text().strip()] if made_by.exists() else []), whole_command(parser, args)]
+    (args.out / "README.md").write_text(text(numbers, commands))
     pictures(trials, numbers, args.out)
-    print(text(numbers, command))
+    print(text(numbers, commands))
 
 
 if __name__ == "__main__":
