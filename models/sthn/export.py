@@ -12,6 +12,7 @@ numpy pipeline against the network end to end; the command fails otherwise.
 from __future__ import annotations
 
 import argparse
+import csv
 import dataclasses
 import io
 import sys
@@ -28,7 +29,7 @@ from torch import Tensor, nn
 
 from . import pipeline, procedural
 from .bundle import Bundle, BundleError, golden_arrays, in_memory, write_bundle
-from .checkpoint import load_checkpoint, one_stage
+from .checkpoint import load_checkpoint, one_stage, read_experiment, stated_lookup
 from .network import Lookup, Matcher, NetworkConfig, Sthn
 from .parity import to_tensor
 
@@ -48,6 +49,9 @@ FRAME_WIDTH_M = 512
 PAPER_LEVELS = {512: 2, 1024: 4, 1536: 4}
 PAPER_SIGMA_M = {"coarse": 12.7, "refine": 9.7}
 """Table II: mean centre error 15.90 and 12.12 m at W_S = 1536, over 1.253 (Rayleigh) per axis."""
+
+RAYLEIGH = 1.253
+"""Mean distance in the plane over the 1-sigma of an axis."""
 
 
 class MapEncoder(nn.Module):
@@ -247,9 +251,9 @@ def _arguments() -> argparse.ArgumentParser:
     parser.add_argument("--levels", type=int, help="correlation levels of the coarse stage; must be given for a .pth")
     lookups = [direction.value for direction in Lookup]
     parser.add_argument("--lookup", choices=lookups, help="that the weights were trained with, where the checkpoint states none")
-    parser.add_argument("--search-radius-m", type=float, help="D_C (default: (W_S - 512) / 2, at least 50)")
-    parser.add_argument("--coarse-sigma-m", type=float, default=PAPER_SIGMA_M["coarse"], help="1-sigma per axis (default: paper)")
-    parser.add_argument("--refine-sigma-m", type=float, default=PAPER_SIGMA_M["refine"], help="1-sigma per axis (default: paper)")
+    parser.add_argument("--search-radius-m", type=float, help="D_C (default: the training's; else (W_S - 512) / 2, at least 50)")
+    parser.add_argument("--coarse-sigma-m", type=float, help="1-sigma per axis (default: the training's validation; the paper's)")
+    parser.add_argument("--refine-sigma-m", type=float, help="1-sigma per axis (default: the training's validation; the paper's)")
     parser.add_argument("--licence", help="of the weights (default: unknown; MIT for weights made by formula)")
     return parser
 
@@ -275,6 +279,51 @@ def _has_fine(path: Path) -> bool:
     return isinstance(document, dict) and document.get("netG_fine") is not None
 
 
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """Where weights come from, as far as the files say."""
+
+    description: str
+    data: list[str]
+    sigma_m: dict[str, float]
+    """Per axis, of the stages that were measured."""
+    seed: int | None = None
+    search_radius_m: float | None = None
+
+
+def origin_of(checkpoint: Path) -> Origin:
+    """Of a training of `sthn.train` by the files of its run; any other checkpoint is taken for the authors' release."""
+    made = read_experiment(checkpoint)
+    if made is None and stated_lookup(checkpoint) is None:
+        description = f"Released STHN checkpoint {checkpoint.name} (Xiao et al., RA-L 2024)."
+        return Origin(description, ["Boson-nighttime (ARPL, New York University)"], PAPER_SIGMA_M)
+    if made is None:
+        return Origin(f"Trained by sthn.train; {checkpoint.name} lies apart from its run, which says on what.", [], {})
+    described = {name: made["data"][name] for name in ("train", "extended", "validation") if name in made["data"]}
+    data = []
+    for name, table in described.items():
+        what = {key: table.get(key, made["data"].get(key)) for key in ("kind", "folder", "split", "maps", "map")}
+        data.append(f"{name}: " + ", ".join(f"{key} {value}" for key, value in what.items() if value))
+    table = made["training"]
+    description = (
+        f"Trained by sthn.train: {made['row']}. W_S = {made['window_m']}, D_C = {made['search_radius_m']:g} m, "
+        f"{table['steps']} steps of {table['batch']}, from {table['init'] or 'random weights'}; {checkpoint.name}."
+    )
+    return Origin(description, data, _validated(checkpoint), made["seed"], float(made["search_radius_m"]))
+
+
+def _validated(checkpoint: Path) -> dict[str, float]:
+    """Sigma of each stage by `validation.csv`: MACE, which is at least the mean centre error, as the paper's. Of the best row
+    for `best`, else of the last."""
+    file = checkpoint.resolve().parent / "validation.csv"
+    rows = list(csv.DictReader(file.open(encoding="utf-8"))) if file.is_file() else []
+    if not rows:
+        return {}
+    row = min(rows, key=lambda r: float(r["mace_m"])) if checkpoint.name == "best" else rows[-1]
+    found = {"coarse": float(row["mace_coarse_m"]) / RAYLEIGH, "refine": float(row["mace_m"]) / RAYLEIGH}
+    return {stage: round(sigma, 3) for stage, sigma in found.items()}
+
+
 def main(arguments: list[str] | None = None) -> int:
     """The command; returns its exit code."""
     parser = _arguments()
@@ -283,28 +332,34 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error("expected either a checkpoint or --random-weights")
     try:
         config = _config(options)
+        stages = ("coarse", "refine") if config.two_stages and not options.one_stage else ("coarse",)
         if options.checkpoint is None:
             network = procedural.network(config, options.random_weights)
-            description = "The published architecture with weights made by formula: for tests and benchmarks, it locates nothing."
+            origin = Origin(
+                "The published architecture with weights made by formula: for tests and benchmarks, it locates nothing.",
+                [], PAPER_SIGMA_M,
+            )  # fmt: skip
         else:
             network = load_checkpoint(options.checkpoint, config, options.fine, options.lookup and Lookup(options.lookup))
-            description = f"Released STHN checkpoint {options.checkpoint.name} (Xiao et al., RA-L 2024)."
+            origin = origin_of(options.checkpoint)
+        sigma_m = origin.sigma_m | {s: v for s in stages if (v := getattr(options, f"{s}_sigma_m")) is not None}
+        if missing := [f"--{stage}-sigma-m" for stage in stages if stage not in sigma_m]:
+            raise BundleError(f"{options.checkpoint}: no validation.csv beside it: expected {', '.join(missing)}, found none")
         if options.one_stage:
             network = one_stage(network)
         spoken = " ".join(sys.argv[1:] if arguments is None else arguments)
-        provenance = {"description": description, "command": f"python -m sthn.export {spoken}", "data": []}
-        if options.checkpoint is None:
-            provenance["seed"] = options.random_weights
-        else:
-            provenance["data"] = ["Boson-nighttime (ARPL, New York University)"]
+        provenance = {"description": origin.description, "command": f"python -m sthn.export {spoken}", "data": origin.data}
+        seed = options.random_weights if options.checkpoint is None else origin.seed
+        if seed is not None:
+            provenance["seed"] = seed
         differences = export(
             network,
             options.out,
             options.name,
             options.licence or ("MIT" if options.checkpoint is None else "unknown: see the checkpoint's source"),
             provenance,
-            options.search_radius_m or max((config.database_size - FRAME_WIDTH_M) / 2, 50.0),
-            {"coarse": options.coarse_sigma_m, "refine": options.refine_sigma_m},
+            options.search_radius_m or origin.search_radius_m or max((config.database_size - FRAME_WIDTH_M) / 2, 50.0),
+            sigma_m,
         )
     except (ValueError, OSError) as error:
         print(f"export: {error}", file=sys.stderr)

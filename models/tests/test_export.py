@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from sthn.bundle import BundleError, in_memory, read_bundle
 from sthn.checkpoint import one_stage
 from sthn.network import Lookup, Sthn
 from sthn.parity import to_tensor
+from sthn.train import experiment, saving
 
 WIDE = dataclasses.replace(SMALL, database_size=768, fine_padding=32)
 """Small inputs (64 px), but metres as published."""
@@ -131,6 +133,36 @@ def test_the_command_exports_a_checkpoint(network: Sthn, tmp_path: Path, capsys:
     assert export.main([str(checkpoint), "--out", str(tmp_path / "c"), "--name", "n"]) == 1
     assert "model.safetensors" in capsys.readouterr().err
     assert not (tmp_path / "c").exists()
+
+
+def test_a_training_of_ours_says_what_it_was_and_how_good(
+    network: Sthn, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not the authors' release with the paper's numbers: row, sources, D_C and sigmas are the run's."""
+    source = {"kind": "maps", "maps": ["area.tif"], "count": 3}
+    tables = {"network": {"levels": 2}, "data": {"train": source | {"augment": True}, "validation": source}}
+    made = experiment.parse({"row": "own night", "window_m": 768, "search_radius_m": 90, "seed": 7} | tables, "e.toml")
+    (tmp_path / "experiment.json").write_text(json.dumps(dataclasses.asdict(made)))
+    saving.save_released(network, tmp_path / "best")
+    words = [str(tmp_path / "best"), "--out", str(tmp_path / "b"), "--name", "n"]
+    assert export.main(words) == 1
+    assert "expected --coarse-sigma-m, --refine-sigma-m, found none" in capsys.readouterr().err
+    rows = "step,seconds,identity_m,mace_coarse_m,mace_m,not_finite\n1,1,60,25.06,12.53,0\n2,2,60,50.12,37.59,0\n"
+    (tmp_path / "validation.csv").write_text(rows)
+    assert export.main([*words, "--refine-sigma-m", "6"]) == 0
+    manifest = read_bundle(tmp_path / "b").manifest
+    assert (manifest["coarse"]["match_sigma_m"], manifest["refine"]["match_sigma_m"]) == (20.0, 6.0)
+    assert manifest["search_radius_m"] == 90 and manifest["provenance"]["seed"] == 7
+    assert "own night" in manifest["provenance"]["description"] and "STHN" not in manifest["provenance"]["description"]
+    assert manifest["provenance"]["data"][0] == "train: kind maps, maps ['area.tif']"
+    assert manifest["licence"].startswith("unknown")
+    origin = export.origin_of(tmp_path / "final")
+    assert origin.sigma_m == {"coarse": 40.0, "refine": 30.0}, "the last row's"
+    (tmp_path / "experiment.json").unlink()
+    assert (
+        not export.origin_of(tmp_path / "best").sigma_m
+        and "apart from its run" in export.origin_of(tmp_path / "best").description
+    )
 
 
 def options(**given: object) -> argparse.Namespace:
