@@ -415,6 +415,18 @@ def test_a_wrong_key_is_an_error_that_names_it(place: Path, override: str, said:
     assert re.search(said, text), text
 
 
+def test_a_source_of_another_kind_replaces_the_one_below(tmp_path: Path) -> None:
+    """As experiments/README.md says: `split` of the published data would be an unknown key of maps."""
+    file = ROOT / "models/experiments/table-1/ws512-dc64.toml"
+    words = ['data.train.kind="maps"', 'data.train.maps=["a.tif"]', "data.train.count=9", 'data.train.maps=["b.tif"]']
+    made = experiment.read(file, words)
+    assert made.data["train"] == {"kind": "maps", "maps": ["b.tif"], "count": 9}
+    assert made.data["validation"] == {"kind": "boson", "split": "val"}
+    assert experiment.read(file, ['data.train.kind="boson"']).data["train"]["split"] == "train"
+    made = experiment.read(file, ['box.kind="widen"', "box.widen_px=8", 'box.kind="full"'])
+    assert (made.box.kind, made.box.widen_px) == ("full", 8), "a source only"
+
+
 def test_a_base_that_names_itself_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text('base = "b.toml"\n')
     (tmp_path / "b.toml").write_text('base = "a.toml"\n')

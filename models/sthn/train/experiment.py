@@ -1,6 +1,7 @@
 """An experiment: one TOML file, which may take another as its base. Every default is written here, once.
 
-Unknown keys are errors. A table of a file is laid over its base's, key by key; `--set a.b=VALUE` over both.
+Unknown keys are errors. A table of a file is laid over its base's, key by key; `--set a.b=VALUE` over both. A source of
+another `kind` replaces the one below it: first its kind, then its keys.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..data import DataError, Noise
-from ..data.spec import check
+from ..data.spec import KEYS, check
 from ..network import Lookup, NetworkConfig
 
 MAX_BASES = 8
@@ -223,7 +224,8 @@ def _merged(path: Path, seen: list[Path]) -> dict[str, Any]:
 
 
 def _over(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    out = dict(below)
+    other_source = above.get("kind") in KEYS and below.get("kind", above["kind"]) != above["kind"]
+    out = {} if other_source else dict(below)
     for key, value in above.items():
         both = isinstance(value, dict) and isinstance(out.get(key), dict)
         out[key] = _over(out[key], value) if both else value
