@@ -141,7 +141,9 @@ def make_world(seed: int, args: argparse.Namespace) -> Path:
 
 def simulate(ground: Ground, seed: int, args: argparse.Namespace) -> Path:
     """A trial's flight: a short line somewhere on the map; made once."""
-    folder = args.work / f"{ground.name.replace(' ', '-')}-{seed}"
+    # A world's folder says its size too.
+    over = ground.path.stem if ground.whole else ground.path.parent.name
+    folder = args.work / f"{over}-{seed}"
     if not (folder / "done").exists():
         shutil.rmtree(folder, ignore_errors=True)
         noise = ["--yaw-noise-deg", "5", "--scale-noise", "0.05", "--attitude-noise-deg", "2", "--report-attitude"]
