@@ -127,6 +127,21 @@ def test_a_flight_opens_from_a_table_and_travels_to_workers(flight: Path, satell
     assert not np.array_equal(source[0].homography, source.reseeded((3, 1))[0].homography)
 
 
+def test_a_flights_noise_turns_what_was_seen_about_the_frame(flight: Path, satellite: Path) -> None:
+    """Rotated frames have no wedges that tell the answer; what the sensor did not see is said."""
+    spec = {"kind": "flight", "folder": str(flight), "map": str(satellite), "window_m": 1024, "search_radius_m": 100}
+    plain, wide = open_source(spec), open_source(spec | {"surround": True})
+    for index in range(2):
+        one, other = plain[index], wide[index]
+        assert other.surround.shape == other.seen.shape == (768, 768)
+        assert np.array_equal(one.homography, other.homography)
+        assert np.abs(one.thermal.astype(int) - other.thermal).max() <= 2
+        seen = np.ones((512, 512), bool) if one.frame_seen is None else one.frame_seen
+        assert (seen == other.frame_seen).mean() > 0.999 and not one.thermal[~seen].any() and one.thermal[seen].all()
+    noisy = open_source(spec | {"noise": {"rotation_deg": 30, "kind": "rotation"}})
+    assert noisy.source.surround and difference(noisy[1]) < 3 < difference(noisy[1], (6, 0))
+
+
 def test_loader_workers_read_the_map_as_this_process_does(flight: Path, satellite: Path) -> None:
     """A handle that was open before the fork is one file position for all: reads fail, or are of another place."""
     spec = {"kind": "flight", "folder": str(flight), "map": str(satellite), "window_m": 512, "search_radius_m": 300}

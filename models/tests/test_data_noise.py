@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import cv2
@@ -110,6 +111,24 @@ def test_draws_are_seeded_and_all_kinds_come_in_training() -> None:
             kind = "rotation" if abs(h[1, 0]) > 1e-9 else "scale"
         kinds[kind] += 1
     assert min(kinds.values()) >= 3, kinds
+
+
+def test_what_was_seen_moves_with_the_frame() -> None:
+    """A hole in the surround is a hole in the turned frame; without a surround the corners are unseen."""
+    pair = One()[0]
+    assert Noisy(One(), NOISE, 3, "rotation")[0].seen is None, "the surround fills the frame"
+    relation = draw(Noise(rotation_deg=30), "rotation", 512, np.random.default_rng(2))
+    bare = warp(dataclasses.replace(pair, surround=None), relation)
+    assert np.array_equal(bare.frame_seen, bare.seen) and 0.8 < bare.seen.mean() < 0.99
+    inside, outside = (cv2.erode(part.astype(np.uint8), np.ones((5, 5))) > 0 for part in (bare.seen, ~bare.seen))
+    assert (bare.thermal[inside] > 0).all() and not bare.thermal[outside].any()
+    hole = np.ones(pair.surround.shape, bool)
+    hole[300:340, 420:460] = False
+    holed = dataclasses.replace(pair, seen=hole)
+    assert holed.frame_seen.shape == (512, 512) and (~holed.frame_seen).sum() == 1600
+    moved = warp(holed, relation)
+    at = np.argwhere(~moved.seen).mean(0)[::-1]
+    assert geometry.apply(relation, at) == pytest.approx([439.5 - 128, 319.5 - 128], abs=0.5)
 
 
 def test_a_kind_without_a_bound_is_an_error() -> None:

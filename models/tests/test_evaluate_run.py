@@ -190,6 +190,20 @@ def test_the_light_bundle_gives_its_golden_answer() -> None:
         BundleMethod(bundle).match(dataclasses.replace(pair, thermal=pair.thermal[::2, ::2]))
 
 
+def test_a_bundle_is_told_which_pixels_were_seen() -> None:
+    """As the service tells it: what stands where nothing was seen does not matter."""
+    bundle = read_bundle(ROOT / "models" / "bundles" / "lite-1536")
+    margin = bundle.manifest["window_margin_m"]
+    truth = np.array([[1, 0, margin], [0, 1, margin], [0, 0, 1]]) @ bundle.golden["homography"]
+    pair = Pair("golden", bundle.golden["map_rgb"], bundle.golden["frame"], truth)
+    seen = np.ones((512, 512), bool)
+    seen[:, 400:] = False
+    black, white = (dataclasses.replace(pair, thermal=np.where(seen, pair.thermal, v).astype(np.uint8)) for v in (0, 255))
+    method = BundleMethod(bundle)
+    told = [method.match(dataclasses.replace(p, seen=seen)).homography for p in (black, white)]
+    assert np.array_equal(*told) and np.abs(told[0] - method.match(white).homography).max() > 1e-6
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

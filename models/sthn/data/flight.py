@@ -64,6 +64,9 @@ class Rectified:
     """A frame as a north-up square of ground."""
 
     pixels: NDArray[np.uint8]
+    """0 where unseen."""
+    seen: NDArray[np.bool_]
+    """Where the sensor saw the ground: half a pixel round its outermost centres included, in front of the camera."""
     vehicle_px: tuple[float, float]
     """The point under the vehicle."""
     yaw_deg: float
@@ -115,9 +118,15 @@ class RecordedFlight:
         reduced = cv2.resize(inner, (width, height), interpolation=cv2.INTER_AREA) if step > 1 else inner
         half = (step - 1) / 2
         to_reduced = np.array([[1 / step, 0, -(left + half) / step], [0, 1 / step, -(top + half) / step], [0, 0, 1]])
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        pixels = cv2.warpPerspective(reduced, to_reduced @ frame_from_square, (size_px, size_px), flags=flags)
-        return Rectified(pixels, vehicle_px, yaw_deg)
+        to_reduced = to_reduced @ frame_from_square
+        flags, size = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, (size_px, size_px)
+        pixels = cv2.warpPerspective(reduced, to_reduced, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        at = np.arange(size_px)
+        x, y, depth = (row[0] * at[None] + row[1] * at[:, None] + row[2] for row in to_reduced)
+        seen = depth > 1e-3 * (to_reduced[2] @ [(size_px - 1) / 2, (size_px - 1) / 2, 1.0])
+        for value, most in ((x, width - 0.5), (y, height - 0.5)):
+            seen &= (value >= -0.5 * depth) & (value <= most * depth)
+        return Rectified(pixels * seen, seen, vehicle_px, yaw_deg)
 
     def _view(
         self, row: Row, shape: tuple[int, ...], size_px: int, m_per_px: float

@@ -20,7 +20,7 @@ from .noise import Seed, words
 from .pair import FRAME_PX, Pair
 
 SURROUND = 1.5
-"""Side of what is rendered about a frame, in frames: enough for 30 degrees and 30 %."""
+"""Side of what is rendered or rectified about a frame, in frames: enough for 30 degrees and 30 %."""
 
 MIN_ON_MAP = 0.9
 """Least share of a frame's ground that lies on the map."""
@@ -143,6 +143,7 @@ class FlightPairs:
 
     The prior is the row's where it has one within D_C of the truth and `own_priors` is set, else drawn uniformly in the
     disc of D_C about the truth. Windows are north-up in ground metres at their middle, as the service makes them.
+    `surround`: rectifies more than the frame, for noise.
     """
 
     def __init__(
@@ -154,10 +155,12 @@ class FlightPairs:
         seed: Seed = 0,
         m_per_px: float = 1.0,
         own_priors: bool = False,
+        surround: bool = False,
     ) -> None:
         self.flight, self.windows = flight, MapWindows(satellite)
         self.window_m, self.search_radius_m, self.seed = window_px, float(search_radius_m), seed
         self.m_per_px, self.own_priors, self.name = m_per_px, own_priors, flight.name
+        self.surround = surround
         self.rows = [row for row in flight.rows if row.truth is not None]
         if not self.rows:
             raise DataError(flight.folder / "poses.csv", "truth_lat_deg", "at least one row with truth", "none")
@@ -173,18 +176,22 @@ class FlightPairs:
             radius, angle = self.search_radius_m * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
             centre = self.windows.moved(row.truth, radius * np.sin(angle), radius * np.cos(angle))
         east, north = self.windows.offset_m(centre, row.truth)
-        rectified = self.flight.rectified(row, FRAME_PX, self.m_per_px)
+        margin = round((SURROUND - 1) * FRAME_PX / 2) if self.surround else 0
+        rectified = self.flight.rectified(row, FRAME_PX + 2 * margin, self.m_per_px)
+        inner = slice(margin, margin + FRAME_PX)
         # What is known of the attitude places the vehicle in the rectified frame; the truth places it in the window.
         turn = 0.0 if row.truth_yaw_deg is None else np.radians(row.truth_yaw_deg - rectified.yaw_deg)
         middle = np.array([east, -north]) / self.m_per_px + (self.window_m - 1) / 2
         to_vehicle = np.eye(3)
-        to_vehicle[:2, 2] = -np.asarray(rectified.vehicle_px)
+        to_vehicle[:2, 2] = margin - np.asarray(rectified.vehicle_px)
         return Pair(
             name=row.file,
             satellite=self.windows.window(centre, self.window_m, self.m_per_px),
-            thermal=rectified.pixels,
+            thermal=np.ascontiguousarray(rectified.pixels[inner, inner]),
             homography=scene.similarity(*middle, turn, 1.0, False) @ to_vehicle,
             m_per_px=self.m_per_px,
+            surround=rectified.pixels if self.surround else None,
+            seen=None if rectified.seen.all() else rectified.seen,
         )
 
     def reseeded(self, seed: Seed) -> FlightPairs:

@@ -54,21 +54,25 @@ def draw(noise: Noise, kind: NoiseKind, frame_px: int, rng: np.random.Generator)
 def warp(pair: Pair, relation: NDArray[np.float64]) -> Pair:
     """The pair with its frame seen through `relation` (noisy-frame px -> frame px) and the truth with it.
 
-    Bilinear; a frame that comes out coarser is averaged first, so that nothing aliases. 0 where the sensor saw nothing:
-    only where the pair has no surround, or one that is too small.
+    Bilinear; a frame that comes out coarser is averaged first, so that nothing aliases. 0, and not `seen`, where the sensor
+    saw nothing: beyond the surround, or where there is none.
     """
     size = pair.thermal.shape[0]
-    seen, offset = pair.thermal, 0
-    if pair.surround is not None:
-        seen, offset = pair.surround, (pair.surround.shape[0] - size) // 2
+    picture = pair.thermal if pair.surround is None else pair.surround
+    offset = (picture.shape[0] - size) // 2
+    seen = np.ones(picture.shape, np.uint8) if pair.seen is None else pair.seen.astype(np.uint8)
     moved = np.array([[1.0, 0.0, offset], [0.0, 1.0, offset], [0.0, 0.0, 1.0]]) @ relation
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     shrink = np.sqrt(abs(np.linalg.det(relation[:2, :2])))
     if shrink > 1.0:
         # The triangle filter of bilinear antialiasing has variance s^2 / 6, of which interpolation itself is 1 / 6.
-        seen = cv2.GaussianBlur(seen, (0, 0), float(np.sqrt(max((shrink**2 - 1) / 6, 1e-4))))
-    thermal = cv2.warpPerspective(seen, moved, (size, size), flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-    return dataclasses.replace(pair, thermal=thermal, homography=pair.homography @ relation, surround=None)
+        picture = cv2.GaussianBlur(picture, (0, 0), float(np.sqrt(max((shrink**2 - 1) / 6, 1e-4))))
+    thermal, seen = (
+        cv2.warpPerspective(image, moved, (size, size), flags=how | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_CONSTANT)
+        for image, how in ((picture, cv2.INTER_LINEAR), (seen, cv2.INTER_NEAREST))
+    )
+    homography = pair.homography @ relation
+    seen = None if seen.all() else seen > 0
+    return dataclasses.replace(pair, thermal=thermal, homography=homography, surround=None, seen=seen)
 
 
 class Noisy:

@@ -61,11 +61,22 @@ class Pair:
     surround: NDArray[np.uint8] | None = None
     """`[n, n]`, what the sensor saw about the frame, which is its centre crop; n - 512 is even. Noise turns and scales it,
     so that a turned frame has no empty corners. None where no more was seen."""
+    seen: NDArray[np.bool_] | None = None
+    """Where the sensor saw the ground, of the surround's side where there is one, else the frame's. None: everywhere."""
 
     @property
     def window_m(self) -> int:
         """W_S at 1 m/px."""
         return int(self.satellite.shape[0])
+
+    @property
+    def frame_seen(self) -> NDArray[np.bool_] | None:
+        """`[512, 512]`, where the sensor saw the frame; None: everywhere."""
+        if self.seen is None:
+            return None
+        margin = (self.seen.shape[0] - self.thermal.shape[0]) // 2
+        inner = slice(margin, margin + self.thermal.shape[0])
+        return self.seen[inner, inner]
 
     def quad(self) -> geometry.Quad:
         """The frame's edges in the window, truth."""

@@ -15,7 +15,7 @@
     kind = "flight"                   # a recorded flight with truth
     folder = "flights/a"
     map = "A.tif"
-    # seed, m_per_px, own_priors = false, count
+    # seed, m_per_px, own_priors = false, surround (set where there is noise), count
 
 `window_m` is W_S in pixels of `m_per_px`. Any kind may have `noise = { rotation_deg, scale, perspective_px, kind }`.
 """
@@ -38,7 +38,7 @@ COMMON = {"kind": str, "window_m": int, "search_radius_m": float, "seed": int, "
 KEYS: dict[str, dict[str, type]] = {
     "boson": {"folder": str, "split": str, "map": str, "pairs": str, "allow_test_region": bool},
     "maps": {"maps": list, "m_per_px": float, "frame_px": int, "augment": bool, "surround": bool, "style": int},
-    "flight": {"folder": str, "map": str, "m_per_px": float, "own_priors": bool},
+    "flight": {"folder": str, "map": str, "m_per_px": float, "own_priors": bool, "surround": bool},
 }
 NOISE_KEYS = {"rotation_deg": float, "scale": float, "perspective_px": float, "kind": str}
 
@@ -160,4 +160,5 @@ def _flight(spec: Mapping[str, Any], where: str, root: Path, purpose: boson.Purp
         spec.get("seed", 0),
         float(spec.get("m_per_px", 1.0)),
         spec.get("own_priors", False),
+        spec.get("surround", noisy),
     )

@@ -64,9 +64,9 @@ def parse_source(text: str) -> dict[str, Any]:
 
 
 def opener(table: dict[str, Any], seed: int, count: int | None, surround: bool) -> run.OpenPairs:
-    """How a condition opens its pairs. Frames are rendered alike with and without noise."""
+    """How a condition opens its pairs. Frames are made alike with and without noise."""
     common = {"seed": seed} | ({"count": count} if count is not None else {})
-    if table["kind"] == "maps" and surround:
+    if table["kind"] in ("maps", "flight") and surround:
         common["surround"] = True
 
     def open_pairs(window_px: int, radius_m: float) -> PairSource:

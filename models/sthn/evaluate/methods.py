@@ -177,26 +177,27 @@ class BundleMethod:
     def match(self, pair: Pair) -> StagedMatch:
         """Coarse, crop, refine. The search disc is that of D_C about the window's middle."""
         _check_sides(self.name, pair, self.window_px, int(self.bundle.manifest["frame_width_m"]))
-        manifest, rgb, frame = self.bundle.manifest, pair.satellite, pair.thermal
+        manifest, rgb, frame, seen = self.bundle.manifest, pair.satellite, pair.thermal, pair.frame_seen
         detail: dict[str, float | int | str] = {}
         began = time.perf_counter()
         try:
             if manifest["coarse"]["kind"] == "correlation":
                 middle = (manifest["window_width_m"] - 1) / 2
-                found = correlate.run_coarse(self.bundle, rgb, frame, disc=(middle, middle, self.search_radius_m / pair.m_per_px))
+                disc = (middle, middle, self.search_radius_m / pair.m_per_px)
+                found = correlate.run_coarse(self.bundle, rgb, frame, seen, disc)
                 coarse = found.quad
                 detail |= found.evidence
             else:
-                found, coarse = None, pipeline.run_coarse_matcher(self.bundle, rgb, frame, None, {})
+                found, coarse = None, pipeline.run_coarse_matcher(self.bundle, rgb, frame, seen, {})
             between = time.perf_counter()
             quad = coarse
             if not self.coarse_only:
                 shape = manifest["refine"]["crop"]["shape"]
                 if shape == "oriented" and found is not None:
-                    quad, evidence = correlate.run_refine(self.bundle, rgb, frame, None, found)
+                    quad, evidence = correlate.run_refine(self.bundle, rgb, frame, seen, found)
                     detail |= evidence
                 elif shape == "bounding_box":
-                    quad = pipeline.run_refine_bounding_box(self.bundle, rgb, frame, None, coarse, {})
+                    quad = pipeline.run_refine_bounding_box(self.bundle, rgb, frame, seen, coarse, {})
                 else:
                     raise MethodError(f"{self.name}: refine.crop.shape: expected bounding_box, found {shape}")
         except BundleError as error:  # a displacement that is not finite
