@@ -197,6 +197,15 @@ def test_extended_set_in_the_published_layout(scene: SceneMap, tmp_path: Path) -
         generate.write_extended(net, np.zeros_like(rgb), tmp_path / "none.h5", 128, 32)
 
 
+def test_the_published_test_region_is_left_out() -> None:
+    (region,) = generate.excluded("published")
+    assert region.holds(270, 1400) and region.holds(2710, 9400) and not region.holds(2711, 5000) and not region.holds(500, 1399)
+    assert generate.excluded("none") == [] and generate.excluded("1,2,3,4") == [generate.Region(1, 3, 2, 4)]
+    for wrong in ("1,2,3", "2,1,3,4", "test"):
+        with pytest.raises(TgmError, match=f"exclude: expected published.*found {wrong}"):
+            generate.excluded(wrong)
+
+
 def test_thermal_of_a_whole_map(scene: SceneMap, tmp_path: Path) -> None:
     net, rgb = Generator(5, 4).eval(), scene.levels[0][:210, :170].copy()
     rgb[:20] = 0
@@ -229,10 +238,12 @@ def test_the_commands_go_together(scene: SceneMap, tmp_path: Path, capsys: pytes
     satellite = tmp_path / "map.png"
     cv2.imwrite(str(satellite), scene.levels[0][..., ::-1])
     generated = ["generate", "--checkpoint", str(out / "last_model.pth"), "--map", str(satellite)]
-    files = ["--h5", str(tmp_path / "extended_queries.h5"), "--database", str(tmp_path / "extended_database.h5")]
-    assert command.main([*generated, *files, "--stride-px", "300"]) == 0
+    files = ["--h5", str(tmp_path / "extended_queries_test_excluded.h5"), "--database", str(tmp_path / "extended_database.h5")]
+    assert command.main([*generated, *files, "--stride-px", "300"]) == 2
+    assert "--exclude: expected published, none or r0,r1,c0,c1" in capsys.readouterr().err
+    assert command.main([*generated, *files, "--stride-px", "300", "--exclude", "none"]) == 0
     extended = {"kind": "boson", "folder": ".", "split": "extended", "map": "map.png", "window_m": 512, "search_radius_m": 0.1}
-    source = open_source(extended, root=tmp_path)
+    source = open_source(extended, root=tmp_path, purpose="train")
     satellites, thermals = zip(*(aligned(source[i], 32) for i in range(len(source))), strict=True)
     assert len(source) == 9
     painted = generate.paint(checkpoint.load_generator(out / "last_model.pth"), np.stack(satellites), 32)
@@ -241,6 +252,15 @@ def test_the_commands_go_together(scene: SceneMap, tmp_path: Path, capsys: pytes
     assert (error.argmin(1) == np.arange(9)).all()
     assert command.main(generated) == 2
     assert "expected one of --h5 and --thermal-map" in capsys.readouterr().err
+    coarse = tmp_path / "coarse.tif"
+    profile["transform"] = rasterio.transform.from_origin(3e5, 28e5, 1.1, 1.1)
+    with rasterio.open(coarse, "w", driver="GTiff", height=1200, width=1200, count=3, dtype="uint8", **profile) as target:
+        target.write(scene.levels[0].transpose(2, 0, 1))
+    assert command.main([*generated[:4], str(coarse), *files]) == 2
+    assert "expected 1 m/px within 2 % for --h5, found 1.100" in capsys.readouterr().err
+    maps = ["--maps", str(path), "--held-out", str(path), "--width-m", "600"]
+    assert command.main(["train", *maps, *words, "--out", str(out)]) == 2
+    assert "--width-m: expected 512 with --maps, found 600" in capsys.readouterr().err
     data.write_text(f"[held_out]\n{table}")
     assert command.main(["train", "--data", str(data), *words, "--out", str(out)]) == 2
     assert "train: expected at least one table" in capsys.readouterr().err

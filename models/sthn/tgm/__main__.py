@@ -1,8 +1,13 @@
 """`python -m sthn.tgm train|generate`. See `--help` of each.
 
 python -m sthn.tgm train --maps a.tif b.tif --held-out c.tif --rendering-seed 4 --out DIR        (a made-up night)
-python -m sthn.tgm generate --checkpoint DIR/best_model.pth --map a.tif --h5 extended_queries.h5
+python -m sthn.tgm generate --checkpoint DIR/best_model.pth --map a.tif --h5 G/extended_queries_test_excluded.h5 \\
+    --database G/extended_database.h5 --exclude 0,2000,3000,5000
+python -m sthn.tgm generate --checkpoint TGM.pth --map 20201117_BingSatellite.png --exclude published --h5 ... --database ...
 python -m sthn.tgm generate --checkpoint DIR/best_model.pth --map a.tif --thermal-map a_thermal.tif
+
+Training takes an extended set by that name only: it says that the ground of the test flights is left out, which --exclude does.
+For training with geometric noise give --width-m 768 --size-px 768: what is beyond a frame's 512 px then fills its corners.
 """
 
 from __future__ import annotations
@@ -24,7 +29,7 @@ from ..lite.scene import load_map, read_rgb
 from . import generate
 from .checkpoint import TgmError, load_generator, read
 from .pairs import MAX_BLACK_PX, AlignedPairs, usable_indices
-from .rendered import Night, RenderedPairs
+from .rendered import FRAME_WIDTH_M, Night, RenderedPairs
 from .train import Recipe, train
 
 
@@ -51,6 +56,8 @@ def open_sources(args: argparse.Namespace, recipe: Recipe) -> tuple[list[PairSou
         return opened[:-1], opened[-1]
     if not args.held_out:
         raise TgmError("train: --maps needs --held-out")
+    if recipe.width_m != FRAME_WIDTH_M:
+        raise TgmError(f"train: --width-m: expected {FRAME_WIDTH_M:g} with --maps, found {recipe.width_m:g}")
     scenes, unseen = ([load_map(path) for path in paths] for paths in (args.maps, args.held_out))
     night = Night(scenes, args.rendering_seed)
     held_out = RenderedPairs(unseen, night, args.held_out_pairs, recipe.seed + 1_000_000, recipe.size_px)
@@ -92,6 +99,11 @@ def run_generate(args: argparse.Namespace) -> None:
     """The extended set of a map, or its thermal as a map."""
     if (args.h5 is None) == (args.thermal_map is None):
         raise TgmError("generate: expected one of --h5 and --thermal-map")
+    if args.h5 and args.map.suffix.lower() == ".png" and not args.exclude:
+        raise TgmError(
+            f"{args.map}: --exclude: expected published, none or r0,r1,c0,c1 for a map without coordinates, found none"
+        )
+    regions = [region for text in args.exclude for region in generate.excluded(text)]
     net = load_generator(args.checkpoint, args.tanh).to(args.device)
     kept = read(args.checkpoint).get("training", {}).get("recipe", {})
     size_px, width_m = args.size_px or kept.get("size_px", 512), args.width_m or kept.get("width_m", 512.0)
@@ -100,11 +112,15 @@ def run_generate(args: argparse.Namespace) -> None:
             rgb, m_per_px = source.read([1, 2, 3]).transpose(1, 2, 0), 1.0
     else:
         rgb, m_per_px = read_rgb(args.map)
-    tile_px = round(width_m / m_per_px)
+    if args.h5 and abs(m_per_px - 1) > generate.MAX_SCALE_ERROR:
+        raise TgmError(
+            f"{args.map}: expected 1 m/px within 2 % for --h5, found {m_per_px:.3f}: `gdalwarp -tr 1 1` in metres first"
+        )
+    # The published layout knows pixels only.
+    tile_px = round(width_m if args.h5 else width_m / m_per_px)
     if min(rgb.shape[:2]) < tile_px:
         raise TgmError(f"{args.map}: expected at least {tile_px} px a side, found {rgb.shape[1]} x {rgb.shape[0]}")
     if args.h5:
-        regions = [generate.Region(*region) for region in args.exclude]
         places = generate.write_extended(net, rgb, args.h5, tile_px, size_px, args.stride_px, regions, args.batch, args.device)
         if args.database:
             # Only the names of a database file are read: its windows are cropped from the map.
@@ -149,8 +165,13 @@ def main(words: list[str] | None = None) -> int:
     two.add_argument("--size-px", type=int, help="of the network's square; the checkpoint's, else 512")
     two.add_argument("--width-m", type=float, help="ground under it; the checkpoint's, else 512")
     two.add_argument("--stride-px", type=int, default=generate.STRIDE_PX)
-    region = ("TOP", "LEFT", "BOTTOM", "RIGHT")
-    two.add_argument("--exclude", type=int, nargs=4, action="append", default=[], metavar=region, help="map rows and columns")
+    two.add_argument(
+        "--exclude",
+        action="append",
+        default=[],
+        help="ground of the tests, no frame's centre lies in it: r0,r1,c0,c1 (map rows and columns), published (of the published "
+        "PNG) or none; again for more. A PNG needs it",
+    )
     two.add_argument("--batch", type=int, default=16)
     two.add_argument("--tanh", action="store_true", help="the checkpoint was trained with a tanh at the end")
     for command in (one, two):

@@ -26,6 +26,9 @@ from .pairs import to_pixels, to_unit
 STRIDE_PX = 35
 """Of the published database, map pixels."""
 
+MAX_SCALE_ERROR = 0.02
+"""Of a map that an extended set is made of: frames of the published layout are at 1 m/px."""
+
 MIN_VALID = 0.99
 """Share of a tile that must have map."""
 
@@ -42,6 +45,23 @@ class Region:
     def holds(self, row: int, column: int) -> bool:
         """Whether a centre lies in it."""
         return self.top <= row <= self.bottom and self.left <= column <= self.right
+
+
+PUBLISHED_TEST = Region(270, 1400, 2710, 9400)
+"""Of the published map, about which the extended set of its third release is cut."""
+
+
+def excluded(text: str) -> list[Region]:
+    """`published`, `none` or `r0,r1,c0,c1`: rows, then columns."""
+    if text in ("published", "none"):
+        return [PUBLISHED_TEST] if text == "published" else []
+    try:
+        top, bottom, left, right = map(int, text.split(","))
+        if top > bottom or left > right:
+            raise ValueError
+    except ValueError:
+        raise TgmError(f"exclude: expected published, none or r0,r1,c0,c1 with r0 <= r1, c0 <= c1, found {text}") from None
+    return [Region(top, left, bottom, right)]
 
 
 def centres(
