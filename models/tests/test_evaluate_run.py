@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 from sthn import export, geometry, procedural
 from sthn.bundle import read_bundle
 from sthn.data import Pair
-from sthn.evaluate import figures, methods, pictures
+from sthn.evaluate import figures, methods, pictures, run, tables
 from sthn.evaluate.__main__ import main, parse_source
 from sthn.evaluate.methods import BundleMethod, MethodError, Spec
 from sthn.evaluate.results import PairScore, Results
@@ -188,6 +188,24 @@ def test_the_light_bundle_gives_its_golden_answer() -> None:
     assert match.coarse is not None and {"coarse_s", "refine_s", "peak_mass"} <= match.detail.keys()
     with pytest.raises(MethodError, match="expected a frame of 512 px, found 256"):
         BundleMethod(bundle).match(dataclasses.replace(pair, thermal=pair.thermal[::2, ::2]))
+
+
+def test_a_coarse_answer_that_is_not_finite_is_not_drawn(folder: Path) -> None:
+    """A pictured pair like any other: no number, and the run goes on."""
+    method = Spec.parse(f"checkpoint:{folder}/released").open(50)
+    pair = Pair("p", procedural.image(768 // SCALE), np.zeros((128, 128), np.uint8), np.eye(3), m_per_px=SCALE)
+    found = dataclasses.replace(method.match(pair), coarse=np.full((4, 2), np.nan))
+    method.match = lambda _: found
+    score = run.match_one(method, pair, keep_quads=True)
+    assert score.coarse is None and score.quad is not None
+
+
+def test_the_results_are_there_though_the_tables_fail(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """UASTHN's evaluation stops on an undefined name after its metrics and before its results are saved."""
+    monkeypatch.setattr(tables, "tables", lambda _: (_ for _ in ()).throw(NameError("x")))
+    with pytest.raises(NameError):
+        main([source(folder), "--pairs", "1", "--radius-m", "50", "--method", "rival:identity", "--out", str(tmp_path)])
+    assert len(Results.read(tmp_path).cells[0].scores) == 1
 
 
 def test_a_bundle_is_told_which_pixels_were_seen() -> None:

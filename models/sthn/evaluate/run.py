@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from tqdm import trange
 
@@ -125,7 +126,7 @@ def match_one(method: Rival, pair: Pair, keep_quads: bool = False) -> PairScore:
 
 def _quads(match: Match, pair: Pair) -> tuple[Quad | None, Quad | None]:
     found = [quad_of(match, pair), match.coarse if isinstance(match, StagedMatch) else None]
-    return tuple(None if q is None else relative_m(pair, q).round(3).tolist() for q in found)
+    return tuple(None if q is None or not np.isfinite(q).all() else relative_m(pair, q).round(3).tolist() for q in found)
 
 
 def machine() -> str:
