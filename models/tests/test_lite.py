@@ -163,6 +163,10 @@ def test_training_goes_on_where_it_stopped(tmp_path, monkeypatch):
     for name, value in whole.items():
         assert torch.equal(value, resumed[name]), name
     assert len((stopped / "curve.csv").read_text().splitlines()) == 5
+    with pytest.raises(SystemExit, match="recipe: expected .*'steps': 5.* found .*'steps': 4"):
+        run(stopped, "--steps", "5")
+    with pytest.raises(SystemExit, match="absent: expected at least one GeoTIFF"):
+        run(tmp_path / "other", "--worlds", str(tmp_path / "absent"))
 
 
 def stop_after(save):

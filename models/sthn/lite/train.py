@@ -3,7 +3,8 @@
     python -m sthn.lite.train coarse --maps DIR --worlds DIR --out DIR [--steps N] [--seed S]
     python -m sthn.lite.train refine ...
 
-The same command goes on from the last checkpoint in `--out`. `curve.csv` and `command.txt` stay beside the weights.
+The same command goes on from the last checkpoint in `--out`; with another recipe it is an error. `curve.csv` and
+`command.txt` stay beside the weights.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import math
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch.utils.data import DataLoader
@@ -116,12 +118,22 @@ def start_from(net: torch.nn.Module, weights: Path) -> None:
         raise SystemExit(f"{weights}: expected the encoders of this stage, found others ({extra or missing})")
 
 
+def recipe_of(args: argparse.Namespace, scenes: list[SceneMap]) -> dict[str, Any]:
+    """What a training that goes on must have in common with its beginning."""
+    share = args.generated_share if args.generated else 0.0
+    kept = {key: getattr(args, key) for key in ("stage", "steps", "batch", "peak", "seed")}
+    return kept | {"generated_share": share, "scenes": [scene.name for scene in scenes]}
+
+
 def train(args: argparse.Namespace) -> None:
     """Runs, or goes on with, a training."""
     torch.manual_seed(args.seed)
     torch.set_num_threads(args.threads)
     args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "command.txt").write_text("python -m sthn.lite.train " + " ".join(args.words) + "\n")
+    worlds = sorted(p for p in args.worlds.glob("**/*.tif") if not p.stem.endswith("_classes")) if args.worlds else []
+    if args.worlds and not worlds:
+        raise SystemExit(f"{args.worlds}: expected at least one GeoTIFF of `nightfix simulate --world`, found none")
+    scenes = training_scenes(args.maps, worlds)
     task = TASKS[args.stage]()
     net = task.net.to(memory_format=torch.channels_last)
     average = torch.optim.swa_utils.AveragedModel(
@@ -133,14 +145,17 @@ def train(args: argparse.Namespace) -> None:
         start_from(net, args.init / "weights.pt")
         average.module.load_state_dict(net.state_dict())
     last = args.out / "last.pt"
+    recipe = recipe_of(args, scenes)
     if last.exists():
         kept = torch.load(last, weights_only=True)
+        # Checkpoints from before recipes were kept have none to compare.
+        if kept.get("recipe", recipe) != recipe:
+            raise SystemExit(f"{last}: recipe: expected {recipe}, found {kept['recipe']}")
         net.load_state_dict(kept["net"])
         average.load_state_dict(kept["average"])
         optimiser.load_state_dict(kept["optimiser"])
         step, spent_s = kept["step"], kept["spent_s"]
-    worlds = sorted(p for p in args.worlds.glob("**/*.tif") if not p.stem.endswith("_classes")) if args.worlds else []
-    scenes = training_scenes(args.maps, worlds)
+    (args.out / "command.txt").write_text("python -m sthn.lite.train " + " ".join(args.words) + "\n")
     if args.generated:
         pairs: Pairs = PairsWithGenerated(
             scenes, task.spec, args.seed, step * args.batch, load_generated(args.generated, scenes), args.generated_share
@@ -185,6 +200,7 @@ def train(args: argparse.Namespace) -> None:
                     "net": net.state_dict(),
                     "average": average.state_dict(),
                     "optimiser": optimiser.state_dict(),
+                    "recipe": recipe,
                     "step": step,
                     "spent_s": spent_s + time.monotonic() - began,
                 }
