@@ -44,6 +44,7 @@ def test_a_released_folder_with_its_stored_numbers(case: Path, tmp_path: Path, c
     assert convert.main([str(case), "--out", str(tmp_path / "sthn-768")]) == 0
     manifest = read_bundle(tmp_path / "sthn-768").manifest
     assert manifest["name"] == "sthn-768"
+    assert manifest["licence"].startswith("unknown"), "the hub's tag and the data's gate disagree: nobody says it for the user"
     assert manifest["refine"]["crop"]["padding_m"] == 32, "the paper's, not the released config's 0"
     assert "stored parity case" in capsys.readouterr().out
     # The same bundle beside other stored numbers.

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import rasterio
 from conftest import ROOT
+from PIL import Image
 from pyproj import Geod, Transformer
 
 from sthn.data import DataError, boson, open_source
@@ -137,8 +138,24 @@ def test_the_extended_set_with_the_test_region_is_refused_for_training(folder: P
         open_source(spec, purpose="train")
     assert len(open_source(spec | {"allow_test_region": True}, purpose="train")) == 5
     assert boson.queries_path(folder, "extended").name == "extended_queries.h5"
-    (tmp_path / "extended_queries_test_excluded.h5").touch()
-    assert boson.queries_path(tmp_path, "extended", "train").name == "extended_queries_test_excluded.h5"
+    # With both there, as in the release, the one without the test region: for any purpose, and whatever is allowed.
+    for name in ("extended_queries.h5", "extended_queries_test_excluded.h5"):
+        (tmp_path / name).touch()
+    for purpose, allowed in (("train", False), ("train", True), ("evaluate", False)):
+        assert boson.queries_path(tmp_path, "extended", purpose, allowed).name == "extended_queries_test_excluded.h5"
+
+
+def test_no_data_of_others_are_in_the_repository() -> None:
+    """Their licence forbids it: no HDF5, no weights in the authors' layout, no map, but of the project's own making."""
+    done = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if done.returncode or not done.stdout:
+        pytest.skip("not a git checkout")
+    files = [Path(name) for name in done.stdout.splitlines()]
+    ours = {Path("tests/flights/procedural") / name for name in ("world.tif", "world_classes.tif")}
+    kinds = {".h5", ".hdf5", ".pth", ".tif", ".tiff"}
+    assert [f for f in files if f.suffix.lower() in kinds and f not in ours] == []
+    pictures = [f for f in files if f.suffix.lower() == ".png" and (ROOT / f).is_file()]
+    assert [f for f in pictures if max(Image.open(ROOT / f).size) > 2048] == [], "no map"
 
 
 @pytest.mark.parametrize(

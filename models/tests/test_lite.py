@@ -9,7 +9,7 @@ import rasterio
 import torch
 
 from sthn import correlate, geometry
-from sthn.lite import coarse, refine, train
+from sthn.lite import bar, coarse, refine, train
 from sthn.lite.pairs import COARSE, FRAME_WIDTH_M, REFINE, Pairs
 from sthn.lite.scene import SceneMap, px_to_m, pyramid
 
@@ -180,3 +180,15 @@ def stop_after(save):
         save(state, path)
 
     return wrapped
+
+
+def test_the_bars_page_says_its_own_radius_and_whose_error_mace_has():
+    page = bar.report(["--radius-m", "64"], 64.0, "| a |")
+    assert "D_C = 64 m" in page and "512 m" not in page.split("\n", 3)[3] and page.endswith("| a |\n")
+    assert "error of height counts against\nthe method" in page
+    # As said: a frame of 5 % more ground moves a corner by 18 m.
+    fix = {"status": "fix", "window": {"lat_deg": 25.0, "lon_deg": 55.0, "width_m": 1536}}
+    pose = {"truth_lat_deg": "25", "truth_lon_deg": "55", "truth_yaw_deg": "3", "yaw_deg": "3"}
+    quad = correlate.similarity_quad(np.array([767.5, 767.5]), 0.0, 1.05, 512)
+    fix["homography"] = geometry.homography_of_edges(512, quad)
+    assert bar.corner_error_m(fix, pose) == pytest.approx(0.05 * 256 * 2**0.5, abs=1e-6)
