@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import json
 from pathlib import Path
 
 import cv2
@@ -436,7 +437,9 @@ def test_a_base_that_names_itself_is_an_error(tmp_path: Path) -> None:
 
 NOISES = {"rotation": ("5", "10", "30"), "scale": ("0p1", "0p2", "0p3"), "perspective": ("8", "16", "32")}
 NOISE_KEYS = {"rotation": "rotation_deg", "scale": "scale", "perspective": "perspective_px"}
-EXPERIMENTS = sorted(path for path in (ROOT / "models/experiments").glob("*/*.toml"))
+OTHERS = ("rivals", "tgm")
+"""Of other commands: `sthn.rivals.train --data`, `sthn.tgm train --data`."""
+EXPERIMENTS = sorted(path for path in (ROOT / "models/experiments").glob("*/*.toml") if path.parent.name not in OTHERS)
 
 
 def test_every_experiment_of_the_paper_has_a_file_that_says_what_its_name_says() -> None:
@@ -463,11 +466,10 @@ def test_every_experiment_of_the_paper_has_a_file_that_says_what_its_name_says()
     assert all("extended" not in made[f"ablations/without-tgm-ws512-dc{radius}"].data for radius in (50, 64, 128, 256, 512))
 
 
-def test_an_experiment_of_the_paper_trains_on_the_published_layout(tmp_path: Path) -> None:
-    """The committed file as it is, but for sizes: files in the released layout in, a checkpoint out."""
+def published(folder: Path) -> Path:
+    """A data set in the published layout, of a few frames."""
     from sthn.data import boson
 
-    folder = tmp_path / "data" / "v3"
     folder.mkdir(parents=True)
     pixels = np.random.default_rng(0).integers(1, 255, (700, 760, 3), dtype=np.uint8)
     (folder.parent / boson.MAP_NAME).parent.mkdir(parents=True)
@@ -476,6 +478,32 @@ def test_an_experiment_of_the_paper_trains_on_the_published_layout(tmp_path: Pat
         name = "extended_queries_test_excluded" if split == "extended" else f"{split}_queries"
         boson.write(folder / f"{name}.h5", [pixels[:512, :512, 0]] * 2, [(300, 330), (340, 400)])
         boson.write(folder / f"{split}_database.h5", [np.zeros((4, 4), np.uint8)] * 2, [(310, 330), (345, 390)])
+    return folder
+
+
+def test_the_rivals_and_the_tgm_train_on_the_published_layout(tmp_path: Path) -> None:
+    """The committed files as they are, but for sizes."""
+    from sthn.rivals import train as rivals
+    from sthn.tgm.__main__ import main as tgm
+
+    files = {path.name: path for name in OTHERS for path in (ROOT / "models/experiments" / name).glob("*.toml")}
+    assert len(files) == 6
+    for radius in (50, 64, 128, 256, 512):
+        source, table = rivals.read_tables(files[f"table-1-dc{radius}.toml"])
+        assert (source["window_m"], source["search_radius_m"], table["batch"]) == (512, radius, 16)
+    root = published(tmp_path / source["folder"]).parent
+    words = ["ihn", "--data", str(files["table-1-dc512.toml"]), "--root", str(root), "--out", str(tmp_path / "ihn")]
+    assert rivals.main([*words, "--steps", "1", "--batch", "2", "--side-px", "32"]) == 0
+    facts = json.loads((tmp_path / "ihn/training.json").read_text())
+    assert (facts["peak"], facts["batch"], facts["search_radius_m"]) == (1e-4, 2, 512)
+    words = "train --size-px 32 --downs 5 --ngf 4 --ndf 4 --batch 2 --epochs 1 --decay-epochs 0 --steps-per-epoch 1".split()
+    words += ["--data", str(files["boson.toml"]), "--root", str(root), "--out", str(tmp_path / "tgm")]
+    assert tgm(words) == 0 and (tmp_path / "tgm/best_model.pth").is_file()
+
+
+def test_an_experiment_of_the_paper_trains_on_the_published_layout(tmp_path: Path) -> None:
+    """The committed file as it is, but for sizes: files in the released layout in, a checkpoint out."""
+    folder = published(tmp_path / "data" / "v3")
     small = ["network.resize_width=32", "network.iterations=1", "training.steps=1", "training.batch=2", "training.workers=0"]
     words = [str(ROOT / "models/experiments/table-1/ws512-dc64.toml"), "--out", str(tmp_path / "run"), "--accelerator", "cpu"]
     for override in [f'data.root="{folder.parent}"', 'data.folder="v3"', *small]:

@@ -47,7 +47,7 @@ def open_sources(args: argparse.Namespace, recipe: Recipe) -> tuple[list[PairSou
         if not isinstance(tables.get("held_out"), dict):
             raise TgmError(f"{args.data}: held_out: expected a table, found {tables.get('held_out')!r}")
         opened = [
-            open_source(table, f"{args.data}: {name}", args.data.parent, purpose)
+            open_source(table, f"{args.data}: {name}", args.root or args.data.parent, purpose)
             for name, table, purpose in (
                 *((f"train {i}", table, "train") for i, table in enumerate(tables["train"])),
                 ("held_out", tables["held_out"], "evaluate"),
@@ -141,6 +141,7 @@ def main(words: list[str] | None = None) -> int:
     one = commands.add_parser("train", description=run_train.__doc__)
     one.set_defaults(run=run_train)
     one.add_argument("--data", type=Path, help="TOML with tables [[train]] and [held_out]")
+    one.add_argument("--root", type=Path, help="what the paths of --data are relative to (default: its folder)")
     one.add_argument("--maps", type=Path, nargs="+", help="GeoTIFFs to train on, with a made-up night")
     one.add_argument("--held-out", type=Path, nargs="+", help="GeoTIFFs to validate on")
     one.add_argument("--rendering-seed", type=int, default=0, help="of the rule from ground to heat")
