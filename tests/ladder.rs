@@ -144,7 +144,8 @@ fn at_the_scale_of_a_low_frame_the_disc_is_narrower_and_the_next_bundle_answers(
         assert_eq!(bundle(&bench.locate(&frame, pose, prior(middle(), radius_m))), expected, "{radius_m} m");
     }
     // D_C holds the prior, the low frame does not; beyond D_C it is the prior.
-    for (radius_m, expected) in [(70.0, Reason::FootprintTooSmall), (128.0, Reason::FootprintTooSmall), (128.1, Reason::PriorTooWide)]
+    for (radius_m, expected) in
+        [(70.0, Reason::FootprintTooSmall), (128.0, Reason::FootprintTooSmall), (128.1, Reason::PriorTooWide)]
     {
         let answer = bench.locate(&frame, pose, prior(middle(), radius_m));
         assert_eq!((reason(&answer), bundle(&answer)), (Some(expected), "large"), "{radius_m} m");

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
+import scipy.ndimage
 import scipy.signal
 import torch
 from numpy.typing import NDArray
@@ -168,12 +169,17 @@ def run_coarse(
     turn = angles[k] + (weight * ((angles - angles[k] + 180) % 360 - 180)).sum()
     scale = float((weight * np.array([x[1] for x in hypotheses])).sum())
     # Evidence on the posterior over places (all hypotheses together): mass of the square about a place; the second peak
-    # is the heaviest square more than 6 cells from the first.
+    # is the heaviest square more than 6 cells from the first; the near peak the heaviest maximum nearer than that.
     places = p.sum(0)
     square = scipy.signal.convolve2d(places, np.ones((2 * r + 1, 2 * r + 1)), mode="same")
     mass = square[i, j] / total
     away = np.hypot(np.arange(places.shape[0])[:, None] - i, np.arange(places.shape[1])[None] - j) > 6
     second = np.where(inside & away, square, 0.0).max() / square[i, j]
+    touching = scipy.signal.convolve2d(places, np.ones((3, 3)), mode="same")
+    maximum = (places > 0) & (places >= scipy.ndimage.maximum_filter(places, 3, mode="constant"))
+    rows, columns = np.abs(np.arange(places.shape[0]) - i), np.abs(np.arange(places.shape[1]) - j)
+    maximum &= np.maximum(rows[:, None], columns[None]) >= 3
+    near_peak = np.where(inside & ~away & maximum, touching, 0.0).max() / touching[i, j]
     share = places / total
     entropy = -(share[share > 0] * np.log2(share[share > 0])).sum()
     centre = np.array([window_px(cell_x), window_px(cell_y)])
@@ -181,6 +187,7 @@ def run_coarse(
     evidence = {
         "peak_mass": float(mass),
         "second_peak": float(second),
+        "near_peak": float(near_peak),
         "entropy_bits": float(entropy),
         "peak_logit": float(top),
     }

@@ -211,7 +211,7 @@ impl FixMessage {
                 width_m: w.width_m,
                 map_affine: w.map_affine,
             }),
-            evidence: answer.evidence.clone(),
+            evidence: finite(&answer.evidence),
             bundle: answer.bundle.as_deref().unwrap_or(bundle).to_owned(),
             map: map.clone(),
             prior: answer.prior.map(|p| PriorEcho {
@@ -231,4 +231,9 @@ impl FixMessage {
     pub fn position(&self) -> Option<LatLon> {
         LatLon::new(self.lat_deg?, self.lon_deg?)
     }
+}
+
+/// What JSON can say: a cue without a number (a quad whose sides cross has no ratio) is left out.
+fn finite(evidence: &Evidence) -> Evidence {
+    evidence.iter().filter(|(_, value)| value.is_finite()).map(|(name, value)| (name.clone(), *value)).collect()
 }

@@ -166,5 +166,5 @@ fn localizer(settings: &Settings, bundle: Bundle, further: Vec<Bundle>, map: &Ge
         .map(|rung| json!({"bundle": rung.bundle().manifest.name, "search_radius_m": rung.search_radius_m()}))
         .collect();
     let search = json!({"kind": ladder.search_kind(), "max_radius_m": settings.search.max_radius_m});
-    Ok(((), json!({"ladder": rungs, "search": search})))
+    Ok(((), json!({"ladder": rungs, "search": search, "gates": settings.gates.enabled})))
 }

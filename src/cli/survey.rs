@@ -9,7 +9,8 @@ use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
 
 /// Before the flight: where on this map will fixes work? Frames of every cell of a grid are rendered as `simulate` does, each
-/// of another night, and located as the service does, with priors, yaw and scale as wrong as said.
+/// of another night, and located as the service does, with priors, yaw and scale as wrong as said, and attitude, map and time
+/// stamps as wrong as `[budget]` states.
 ///
 /// Writes into --out: `survey.tif` (georeferenced; 32-bit floats, a pixel a cell: coverage = fixes / frames, median error m,
 /// median stated 95 % radius m; NaN where no whole frame fits or nothing was found), `survey.csv` (the same with counts and

@@ -108,9 +108,11 @@ pub fn judge_evidence(evidence: &Evidence, calibrated: bool, settings: &GateSett
             return Err(NoFix::new(Reason::LowEvidence, format!("{what}: expected at most {most}, found {found:.2}")));
         }
     }
-    if let Some(ratio) = evidence.get("second_peak").filter(|ratio| !(**ratio <= settings.max_second_peak)) {
-        let detail = format!("second peak over the first: expected at most {}, found {ratio:.3}", settings.max_second_peak);
-        return Err(NoFix::new(Reason::Ambiguous, detail));
+    for (name, what) in [("second_peak", "second peak"), ("near_peak", "second peak near the first")] {
+        if let Some(ratio) = evidence.get(name).filter(|ratio| !(**ratio <= settings.max_second_peak)) {
+            let detail = format!("{what}, over the first: expected at most {}, found {ratio:.3}", settings.max_second_peak);
+            return Err(NoFix::new(Reason::Ambiguous, detail));
+        }
     }
     Ok(())
 }
@@ -195,6 +197,7 @@ mod tests {
         assert_eq!(judge(&[("refine_residual_m", 8.1)]), Err(Reason::LowEvidence));
         assert_eq!(judge(&[("second_peak", 0.51)]), Err(Reason::Ambiguous));
         assert_eq!(judge(&[("second_peak", f64::NAN)]), Err(Reason::Ambiguous));
+        assert_eq!(judge(&[("second_peak", 0.0), ("near_peak", 0.51)]), Err(Reason::Ambiguous));
     }
 
     #[test]

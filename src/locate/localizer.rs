@@ -16,6 +16,10 @@ use std::sync::Arc;
 
 /// Pixels of the map over those of the window up to which a calibration holds.
 const MAX_CALIBRATED_PX: f64 = 2.0;
+/// Share of the frame's square that must have been seen for a calibration to hold.
+const MIN_CALIBRATED_SEEN: f64 = 0.9;
+/// Tilt of the camera up to which a calibration holds, degrees.
+const MAX_CALIBRATED_TILT_DEG: f64 = 10.0;
 /// R may exceed D_C by rounding, no more.
 pub(super) const RADIUS_SLACK: f64 = 1e-6;
 
@@ -87,10 +91,15 @@ impl Localizer {
 
     /// As [`Localizer::locate`], and what was looked at.
     pub fn locate_seen(&mut self, query: &Query<'_>) -> (Answer, Seen) {
+        self.locate_in(query, false)
+    }
+
+    /// The same; `searched`: in a disc that a search chose as the best of many, which the calibration does not cover.
+    pub(super) fn locate_in(&mut self, query: &Query<'_>, searched: bool) -> (Answer, Seen) {
         let mut on_the_way = OnTheWay::default();
         let mut steps = Steps::start();
         let mut total = Steps::start();
-        let outcome = self.answer(query, &mut on_the_way, &mut steps);
+        let outcome = self.answer(query, searched, &mut on_the_way, &mut steps);
         steps.done("gates");
         total.done("total");
         let mut latency_ms = super::Latency::new();
@@ -117,6 +126,11 @@ impl Localizer {
         matches!(self.bundle.manifest.coarse, StageManifest::Correlation(_))
     }
 
+    /// How many encoded windows are kept.
+    pub(super) fn keep_windows(&mut self, count: usize) {
+        self.windows.keep(count);
+    }
+
     /// What a search over a region works with: the bundle, the map, the gates, the map's middle.
     pub(super) fn parts(&mut self) -> (&mut Bundle, &mut MapCache, &GateSettings, LatLon) {
         (&mut self.bundle, &mut self.windows.map, &self.gates, self.map_centre)
@@ -132,8 +146,8 @@ impl Localizer {
         self.windows.encodes()
     }
 
-    /// The gates, in the contract's order.
-    fn answer(&mut self, query: &Query<'_>, way: &mut OnTheWay, steps: &mut Steps) -> Result<Fix, NoFix> {
+    /// The gates, in the contract's order. `searched`: in a disc that a search chose.
+    fn answer(&mut self, query: &Query<'_>, searched: bool, way: &mut OnTheWay, steps: &mut Steps) -> Result<Fix, NoFix> {
         let prior = query.prior.clone()?;
         way.prior = Some(prior);
         self.judge_prior(&prior)?;
@@ -220,9 +234,12 @@ impl Localizer {
         }
         let judgement = judgement.and_then(Result::ok);
         // The calibration was made with a known yaw (a search of the circle tries thirty times as many hypotheses), at the
-        // bundle's own scale and over maps about as fine as its pixels.
+        // bundle's own scale, over maps about as fine as its pixels, with frames that are nearly whole and nearly nadir, in
+        // discs of D_C, and of what the gates let through.
         let fine = self.windows.map.map().m_per_px() <= MAX_CALIBRATED_PX * m_per_px;
-        let calibrated = search.yaw_known && scale == 1.0 && fine;
+        let whole = way.evidence.get("frame_valid").is_some_and(|share| *share >= MIN_CALIBRATED_SEEN);
+        let nadir = tilt_deg(&pose) <= MAX_CALIBRATED_TILT_DEG;
+        let calibrated = search.yaw_known && scale == 1.0 && fine && whole && nadir && !searched && way.withheld.is_none();
         let seen_as = Seeing { pose: &pose, agl_m: way_frame.agl_m, scale, calibrated };
         let fix = self.fix(position, &found, &seen_as, judgement, &mut way.evidence);
         if let Some(sigma_m) = prior.sigma_m {
@@ -356,6 +373,12 @@ struct OnTheWay {
     window: Option<WindowInfo>,
     evidence: Evidence,
     seen: Seen,
+}
+
+/// Between the camera's axis and the vertical, degrees; what is unknown counts as level.
+fn tilt_deg(pose: &Pose) -> f64 {
+    let cosine = |deg: Option<f64>| deg.unwrap_or(0.0).to_radians().cos();
+    (cosine(pose.pitch_deg) * cosine(pose.roll_deg)).clamp(-1.0, 1.0).acos().to_degrees()
 }
 
 fn no_window(error: WindowError) -> NoFix {

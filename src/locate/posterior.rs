@@ -12,6 +12,9 @@
 //! * `M(p) = sum_b P(b, p)`, `N(p)` = sum of M over the (2r + 1)^2 square about p. `peak_mass = N(p*)`;
 //!   `second_peak = max N(p) / N(p*)` over p in the disc more than `max(6, 2 sqrt(2) r)` cells from p* (so that both
 //!   squares are apart); `entropy_bits` of M.
+//! * Nearer than that lie the rivals of a pattern that repeats itself: `S(p)` = sum of M over the 3 x 3 square about p,
+//!   `near_peak = max S(p) / S(p*)` over the maxima of M (no less than its eight neighbours, more than none) in the disc
+//!   whose square does not touch that of p* (3 cells or more along an axis) and that are no further than `second_peak` looks.
 
 use super::correlate::ShiftRange;
 use super::hypotheses::Hypothesis;
@@ -32,6 +35,8 @@ pub struct Peak {
     pub peak_mass: f64,
     /// Mass round the second place over that round the peak.
     pub second_peak: f64,
+    /// The same of the heaviest maximum near the peak, each with the cells that touch it; 0 where there is none.
+    pub near_peak: f64,
     /// Entropy of the posterior over places, bits.
     pub entropy_bits: f64,
     /// Highest logit.
@@ -102,17 +107,25 @@ impl Surface<'_> {
         let shift =
             [(self.range.from[0] + x) as f64 + centroid[0] / weight, (self.range.from[1] + y) as f64 + centroid[1] / weight];
         let (rotation_deg, scale) = self.rotation_and_scale(best_b, x, y)?;
-        let near = |px: i64, py: i64| -> f64 {
+        let square = |px: i64, py: i64, radius: i64| -> f64 {
             let square = (-radius..=radius).flat_map(|oy| (-radius..=radius).map(move |ox| (px + ox, py + oy)));
             square.filter_map(|(px, py)| self.index(px, py)).filter_map(|i| mass.get(i)).sum()
         };
-        let peak_mass = near(x, y);
+        let near = |px: i64, py: i64| square(px, py, radius);
+        let at = |px: i64, py: i64| self.index(px, py).and_then(|i| mass.get(i)).copied().unwrap_or(0.0);
+        let is_maximum = |px: i64, py: i64| {
+            let own = at(px, py);
+            own > 0.0 && (-1..=1).all(|oy| (-1..=1).all(|ox| at(px + ox, py + oy) <= own))
+        };
+        let (peak_mass, own_mass) = (near(x, y), square(x, y, 1));
         let apart = PEAK_CELLS.max(2.0 * std::f64::consts::SQRT_2 * radius as f64);
-        let mut second = 0.0f64;
+        let (mut second, mut near_peak) = (0.0f64, 0.0f64);
         for (i, _) in in_disc.iter().enumerate().filter(|(_, in_disc)| **in_disc) {
             let (px, py) = ((i % width) as i64, (i / width) as i64);
             if ((px - x) as f64).hypot((py - y) as f64) > apart {
                 second = second.max(near(px, py));
+            } else if (px - x).abs().max((py - y).abs()) >= 3 && is_maximum(px, py) {
+                near_peak = near_peak.max(square(px, py, 1) / own_mass);
             }
         }
         let entropy_bits = mass.iter().filter(|m| **m > 0.0).map(|m| -m * m.log2()).sum();
@@ -125,6 +138,7 @@ impl Surface<'_> {
             scale,
             peak_mass,
             second_peak,
+            near_peak,
             entropy_bits,
             peak_logit,
             peak_log_mass,
@@ -209,6 +223,23 @@ mod tests {
         let both = surface(&logits, &one).peak(|_, _, _| true).unwrap();
         assert!((both.second_peak - (-3.0f64).exp()).abs() < 1e-3, "{both:?}");
         assert!(surface(&logits, &one).peak(|_, _, _| false).is_none());
+    }
+
+    #[test]
+    fn rivals_four_cells_away_are_near_peaks_and_a_slope_is_none() {
+        let one = [Hypothesis { rotation_deg: 0.0, scale: 1.0 }];
+        let two = |depth: f64| -> Vec<f32> {
+            let (here, there) = (gaussians(&[([0.0, 0.0], 0.0)]), gaussians(&[([4.0, 0.0], depth)]));
+            here.iter().zip(&there).map(|(a, b)| a.max(*b)).collect()
+        };
+        for depth in [0.1, 1.0, 3.0] {
+            let peak = surface(&two(depth), &one).peak(|_, _, _| true).unwrap();
+            assert!((peak.near_peak - (-depth).exp()).abs() < 0.01 && peak.second_peak < 0.2, "{depth}: {peak:?}");
+            // What lies outside the disc is no rival.
+            assert_eq!(surface(&two(depth), &one).peak(|_, dx, _| dx < 3).unwrap().near_peak, 0.0);
+        }
+        let broad: Vec<f32> = gaussians(&[([0.0, 0.0], 0.0)]).iter().map(|l| l / 9.0).collect();
+        assert_eq!(surface(&broad, &one).peak(|_, _, _| true).unwrap().near_peak, 0.0);
     }
 
     #[test]

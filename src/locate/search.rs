@@ -55,6 +55,8 @@ struct Spots {
 impl Searcher {
     /// For this bundle; tries whether its map features belong to the map.
     pub fn new(localizer: &mut Localizer, settings: SearchSettings) -> Self {
+        // The windows of all places stay encoded from frame to frame, beside that of the prior.
+        localizer.keep_windows(settings.candidates as usize + 1);
         let (bundle, _, gates, _) = localizer.parts();
         let capacity = settings.max_features_mib.saturating_mul(1 << 20);
         let dense = features_belong_to_the_map(bundle);
@@ -231,7 +233,7 @@ fn look_closely(
             return (answer, Seen::default());
         }
         let near = Prior { position, radius_m, sigma_m: None, ..*prior };
-        let (mut answer, seen) = localizer.locate_seen(&Query { prior: Ok(near), ..query.clone() });
+        let (mut answer, seen) = localizer.locate_in(&Query { prior: Ok(near), ..query.clone() }, true);
         let log_mass = answer.evidence.get("peak_log_mass").copied();
         if let Ok(fix) = &answer.outcome {
             let distance_m = fix.position.distance_m(prior.position);
@@ -261,16 +263,11 @@ fn look_closely(
         answer.evidence.insert("search_mass".into(), share);
         answer.evidence.insert("search_logit".into(), logit);
     }
-    if let Ok(fix) = &mut answer.outcome {
+    if let Ok(fix) = &answer.outcome {
         let off = prior.position.enu_to(fix.position);
         answer.evidence.insert("search_east_m".into(), off.east_m);
         answer.evidence.insert("search_north_m".into(), off.north_m);
         answer.evidence.insert("prior_distance_share".into(), off.east_m.hypot(off.north_m) / prior.radius_m.max(1.0));
-        // Calibrated for a disc of D_C, not for the best of a region.
-        fix.calibrated = false;
-        if let Some(p) = fix.p_over_25m.take() {
-            answer.evidence.insert("search_p_over_25m".into(), p);
-        }
     }
     if answer.outcome.is_ok()
         && let Err(no_fix) = judge(first_pass.map(|[share, _]| share), second, min_mass, max_second)

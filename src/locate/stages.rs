@@ -93,7 +93,7 @@ fn run_matcher(
         displacement.iter_mut().flatten().flatten().zip(values).for_each(|(to, from)| *to = f64::from(*from));
         displacement
     };
-    gather_evidence(&outputs, batch, m_per_px, stage, evidence);
+    gather_evidence(&outputs, batch, m_per_px, stage, evidence)?;
     Ok(tensor.data.chunks_exact(8).map(one).collect())
 }
 
@@ -104,25 +104,33 @@ fn first(found: &[Displacement], what: &'static str) -> Result<Displacement, Pai
 
 /// Optional outputs, of the first frame of the batch: `residual` `[B]` (weighted RMS residual of the patches, px), `weight`
 /// `[B]` (their total weight), `covariance` `[B, 4, 4]` (of the corner displacements per axis, px^2), `iterations`
-/// `[K, B, 2, 2, 2]` (cumulative displacements; the size of the last step tells whether they settled). What is not finite
-/// is left out.
-fn gather_evidence(outputs: &Outputs, batch: usize, m_per_px: f64, stage: &str, evidence: &mut Evidence) {
-    let mut put = |name: &str, value: f64| {
-        if value.is_finite() {
-            evidence.insert(format!("{stage}_{name}"), value);
+/// `[K, B, 2, 2, 2]` (cumulative displacements; the size of the last step tells whether they settled). A number that is not
+/// finite is an error: a gate must not miss it.
+fn gather_evidence(
+    outputs: &Outputs,
+    batch: usize,
+    m_per_px: f64,
+    stage: &str,
+    evidence: &mut Evidence,
+) -> Result<(), PairError> {
+    let mut put = |name: &'static str, value: f64| {
+        if !value.is_finite() {
+            return Err(PairError::NonFinite { what: name, found: value.to_string() });
         }
+        evidence.insert(format!("{stage}_{name}"), value);
+        Ok(())
     };
     let per_frame = |name: &str| outputs.get(name).filter(|t| t.data.len() == batch).and_then(|t| t.data.first());
     if let Some(residual) = per_frame("residual") {
-        put("residual_m", f64::from(*residual) * m_per_px);
+        put("residual_m", f64::from(*residual) * m_per_px)?;
     }
     if let Some(weight) = per_frame("weight") {
-        put("weight", f64::from(*weight));
+        put("weight", f64::from(*weight))?;
     }
     if let Some(covariance) = outputs.get("covariance").filter(|t| t.data.len() == 16 * batch) {
         // The middle moves by the mean of the corners: variance 1' C 1 / 16.
         let variance_px2 = covariance.data.iter().take(16).map(|v| f64::from(*v)).sum::<f64>() / 16.0;
-        put("match_sigma_m", variance_px2.max(0.0).sqrt() * m_per_px);
+        put("match_sigma_m", variance_px2.max(0.0).sqrt() * m_per_px)?;
     }
     let steps = outputs.get("iterations").filter(|t| batch > 0 && t.data.len() % (8 * batch) == 0);
     if let Some(iterations) = steps {
@@ -132,9 +140,10 @@ fn gather_evidence(outputs: &Outputs, batch: usize, m_per_px: f64, stage: &str, 
                 (Some(x1), Some(x0), Some(y1), Some(y0)) => f64::from(x1 - x0).hypot(f64::from(y1 - y0)),
                 _ => f64::NAN,
             };
-            put("last_step_m", (0..4).map(step).sum::<f64>() / 4.0 * m_per_px);
+            put("last_step_m", (0..4).map(step).sum::<f64>() / 4.0 * m_per_px)?;
         }
     }
+    Ok(())
 }
 
 /// The light kind of coarse stage: the frame's features under every hypothesis of yaw and scale, correlated with the
@@ -197,6 +206,7 @@ fn put_peak(peak: &Peak, evidence: &mut Evidence) {
     for (name, value) in [
         ("peak_mass", peak.peak_mass),
         ("second_peak", peak.second_peak),
+        ("near_peak", peak.near_peak),
         ("entropy_bits", peak.entropy_bits),
         ("peak_logit", peak.peak_logit),
         ("peak_log_mass", peak.peak_log_mass),

@@ -11,7 +11,7 @@ use std::sync::Arc;
 const MAX_STEP_M: f64 = 512.0;
 /// Shortest: below this, snapping saves nothing.
 const MIN_STEP_M: f64 = 64.0;
-/// Encoded windows that are kept: a vehicle on the rim between two of them goes back and forth.
+/// Encoded windows that are kept, unless told otherwise: a vehicle on the rim between two of them goes back and forth.
 const KEPT: usize = 2;
 
 /// The middle of the window for a prior: a function of the prior alone, so that answers do not depend on history.
@@ -46,6 +46,7 @@ pub struct Windows {
     /// The map.
     pub map: MapCache,
     kept: Vec<(WindowSpec, Kept)>,
+    keep: usize,
     encodes: u64,
 }
 
@@ -63,7 +64,12 @@ pub enum WindowError {
 impl Windows {
     /// None encoded yet.
     pub fn new(map: MapCache) -> Self {
-        Self { map, kept: Vec::new(), encodes: 0 }
+        Self { map, kept: Vec::new(), keep: KEPT, encodes: 0 }
+    }
+
+    /// Keeps so many encoded windows from now on; at least the usual two.
+    pub fn keep(&mut self, count: usize) {
+        self.keep = count.max(KEPT);
     }
 
     /// How many windows were encoded so far.
@@ -81,7 +87,7 @@ impl Windows {
                 let map = encode_map(bundle, &WindowView { size_px: window.size_px, rgb: &window.rgb })?;
                 steps.done("coarse_map");
                 self.encodes += 1;
-                self.kept.truncate(KEPT - 1);
+                self.kept.truncate(self.keep - 1);
                 self.kept.insert(0, (*spec, Kept { window, map }));
             }
         }

@@ -159,8 +159,9 @@ impl Integrity {
                 return Some((field.into(), "a finite number", found.to_string()));
             }
         }
-        if !(1.0..=1e4).contains(&self.bound_m) {
-            return Some(("bound_m".into(), "1 to 10000", self.bound_m.to_string()));
+        // The message says `p_over_25m`.
+        if self.bound_m != 25.0 {
+            return Some(("bound_m".into(), "25", self.bound_m.to_string()));
         }
         if self.cues.is_empty() || self.cues.len() > 64 {
             return Some(("cues".into(), "1 to 64", self.cues.len().to_string()));

@@ -13,7 +13,7 @@ use crate::flight::SimulateError;
 use crate::flight::noise::Dice;
 use crate::flight::sensor::Sensor;
 use crate::geo::Enu;
-use crate::locate::{EncodedFrame, Localizer, Prior, PriorSource, Query};
+use crate::locate::{EncodedFrame, Evidence, Localizer, Prior, PriorSource, Query};
 use crate::map::{GeoTiff, MapError};
 use crate::thermal::{Encoding, Pose};
 use grid::Grid;
@@ -207,9 +207,11 @@ fn judge_cell(
         let bytes: Vec<u8> = shot.counts.iter().flat_map(|count| count.to_le_bytes()).collect();
         let size_px = Some((options.width as u32, options.height as u32));
         let frame = Ok(EncodedFrame { bytes: &bytes, encoding: Encoding::Y16le, size_px });
-        match localizer.locate(&Query { stamp_ns: 0, frame, pose, prior: Ok(prior) }).outcome {
+        let answer = localizer.locate(&Query { stamp_ns: 0, frame, pose, prior: Ok(prior) });
+        match answer.outcome {
             Ok(fix) => {
-                let error_m = fix.position.distance_m(shot.at);
+                let inputs = input_error(&answer.evidence, &mut dice);
+                let error_m = fix.position.offset(inputs).distance_m(shot.at);
                 errors_m.push(error_m);
                 radii_m.push(fix.radius95_m);
                 beyond += usize::from(!(error_m <= fix.radius999_m));
@@ -231,6 +233,13 @@ fn judge_cell(
         beyond_radius999: beyond,
         no_fix,
     })
+}
+
+/// What attitude, map and time stamps are wrong by in flight, as the error budget states them: here they are exact.
+fn input_error(evidence: &Evidence, dice: &mut Dice) -> Enu {
+    let sigma = |name: &str| evidence.get(name).copied().unwrap_or(0.0);
+    let sigma_m = sigma("sigma_tilt_m").hypot(sigma("sigma_map_m")).hypot(sigma("sigma_stamp_m"));
+    Enu { east_m: sigma_m * dice.normal(), north_m: sigma_m * dice.normal() }
 }
 
 /// Random numbers of a frame of a cell, whatever was surveyed before it: this stream and the next.

@@ -31,7 +31,7 @@ RISING_TEXTURES = ("frame_texture", "map_texture")
 CALIBRATION_BINS = 10
 MIN_TEXTURE = 5.0
 """A frame is localisable where its 16 m means differ by this many grey levels, 1-sigma (`frame_texture`)."""
-NEGATIVE = ("another place", "blank", "shutter", "noise", "hituav", "open water")
+NEGATIVE = ("another place", "turned", "blank", "shutter", "noise", "hituav", "open water")
 
 
 def upper_bound(count: int, of: int, level: float = 0.95) -> float:

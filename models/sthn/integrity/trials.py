@@ -118,11 +118,22 @@ def negatives(prefix: str, place: str, other: str, seed: int, frames: int, sigma
     return flights
 
 
+def turned(prefix: str, maps: tuple[str, ...], seed: int, frames: int) -> list[Flight]:
+    """Frames over their own place whose yaw is wrong by 90, 180 or 270 degrees: what repeats itself on the ground looks
+    alike then."""
+    base = Flight("", "", 0, frames, category="turned")
+    return [
+        replace(base, name=f"{prefix}-turned-{i}", source=source, seed=seed + i, radius_m=RADII[i % len(RADII)])
+        for i, source in enumerate(maps)
+    ]
+
+
 PLANS: dict[str, list[Flight]] = {
     "calibration": [
         *localisable("cal", (T4, BERKELEY, "world:201", "world:202"), 1000, 60),
         *negatives("cal", T4, BERKELEY, 1100, 60),
         *negatives("calb", BERKELEY, T4, 1120, 40),
+        *turned("cal", ("world:201", T4, BERKELEY, T4, BERKELEY, "world:202"), 1200, 30),
     ],
     "test": [
         *localisable("test", (T1, T3, "world:301", "world:302"), 2000, 100, stated=True),
@@ -130,6 +141,7 @@ PLANS: dict[str, list[Flight]] = {
         *localisable("exact", (T1, T3, "world:301", "world:302"), 2300, 25, sigma_prior=True),
         *negatives("test", T1, BERKELEY, 2100, 150),
         *negatives("testb", T3, T4, 2120, 150, sigma_prior=True),
+        *turned("test", ("world:301", T1, T3, T1, T3, "world:302"), 2400, 50),
         Flight("test-water", T3, 2200, 400, category="open water"),
     ],
 }
@@ -200,6 +212,8 @@ def run(flight: Flight, args: argparse.Namespace) -> list[dict]:
             spoil(sorted((folder / "frames").glob("*.png")), flight.category, flight.seed, args.thermal)
         if flight.category == "open water":
             keep_water(folder, flight)
+        if flight.category == "turned":
+            turn(folder, flight.seed)
         if flight.over:
             relocate(folder, args.maps / flight.over if ":" not in flight.over else None, flight.seed, args)
         if flight.sigma_prior:
@@ -231,6 +245,17 @@ def run(flight: Flight, args: argparse.Namespace) -> list[dict]:
         ]
     )
     return read(flight, folder, out)
+
+
+def turn(folder: Path, seed: int) -> None:
+    """The yaw is wrong by a quarter, a half or three quarters of a turn."""
+    rng = np.random.default_rng(seed)
+
+    def change(rows: list[dict]) -> list[dict]:
+        turns = rng.integers(1, 4, len(rows))
+        return [row | {"yaw_deg": f"{(float(row['yaw_deg']) + 90.0 * n) % 360.0:.4f}"} for row, n in zip(rows, turns, strict=True)]
+
+    rewrite(folder, change)
 
 
 def relocate(folder: Path, over: Path | None, seed: int, args: argparse.Namespace) -> None:

@@ -116,6 +116,7 @@ impl Region {
                     return Ok(None);
                 }
                 let tile = self.tile(bundle, map, map_centre, &layout, *at, &fft, &mut work)?;
+                self.make_room(&wanted);
                 if planes.len() <= i {
                     planes.push(Plane::new(*at, tile.spec, layout.shifts));
                 }
@@ -130,6 +131,15 @@ impl Region {
             }
         }
         Ok(Some((layout, planes)))
+    }
+
+    /// Drops tiles until the rest fits: first what this disc does not want, the longest unused first; then what was used just
+    /// before, for discs are gone through in one order, and the first tiles come first again.
+    fn make_room(&mut self, wanted: &[[i64; 2]]) {
+        while self.tiles.len() > 1 && self.tiles.iter().map(|(_, tile)| tile.bytes()).sum::<usize>() > self.capacity_bytes {
+            let unwanted = self.tiles.iter().rposition(|(at, _)| !wanted.contains(at)).filter(|i| *i > 0);
+            self.tiles.remove(unwanted.unwrap_or(1));
+        }
     }
 
     /// A tile, made or kept.
@@ -160,11 +170,6 @@ impl Region {
                 Vec::new()
             };
             self.tiles.insert(0, (at, Arc::new(Tile { spectra, allowed, spec })));
-            let mut bytes = 0;
-            self.tiles.retain(|(kept, tile)| {
-                bytes += tile.bytes();
-                *kept == at || bytes <= self.capacity_bytes
-            });
         }
         let first = self.tiles.first().map(|(_, tile)| Arc::clone(tile));
         first.ok_or_else(|| NoFix::new(Reason::NonFinite, "search: expected a tile, found none"))
