@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -221,6 +223,24 @@ def test_a_training_that_stops_and_goes_on_equals_one_that_does_not(place: Path,
         assert all(torch.equal(state[k], other["optimiser"]["state"][index][k]) for k in ("step", "exp_avg", "exp_avg_sq"))
     rows = [[row[:1] + row[2:] for row in csv.reader((out / "curve.csv").open())] for out in (whole, stopped)]
     assert rows[0] == rows[1] and len(rows[0]) == 5, "the curve too, but for its seconds"
+
+
+def test_two_processes_train_as_one_does(place: Path) -> None:
+    """Data parallel over gloo, each with a loader's worker: the same pairs a step, so the same curve up to rounding."""
+    words = ["-m", "sthn.train", str(place / "e.toml"), "--accelerator", "cpu", "--set", "training.steps=2"]
+    words += ["--set", "training.workers=1", "--set", "noise.rotation_deg=0", "--set", 'box.kind="none"']
+    for name, more in (("one-process", []), ("two-processes", ["--devices", "2", "--strategy", "ddp"])):
+        command = [sys.executable, *words, "--out", str(place / name), *more]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+        assert done.returncode == 0, done.stderr
+    for file in ("curve.csv", "validation.csv"):
+        one, two = (list(csv.DictReader((place / n / file).open())) for n in ("one-process", "two-processes"))
+        assert len(one) == len(two) > 0
+        for a, b in zip(one, two, strict=True):
+            assert [float(v) for k, v in b.items() if k != "seconds"] == pytest.approx(
+                [float(v) for k, v in a.items() if k != "seconds"], rel=1e-3
+            )
+    assert load_checkpoint(place / "two-processes/best").config == TINY
 
 
 def test_a_training_may_go_on_from_any_checkpoint(place: Path, whole: Path) -> None:

@@ -96,6 +96,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--seed", type=int, default=0)
     made.add_argument("--pictures", type=int, default=0, help="pairs a condition whose pictures and outlines are stored")
     made.add_argument("--threads", type=int, default=1, help="of PyTorch; bundles run on one")
+    made.add_argument("--device", default="cpu", help="of checkpoints: cpu, cuda, cuda:1; bundles and rivals run on the CPU")
     made.add_argument("--out", type=Path, required=True)
     return made
 
@@ -111,7 +112,7 @@ def main(arguments: list[str] | None = None) -> int:
         specs = methods.parse_all(options.method)
         open_pairs = opener(table, options.seed, options.pairs, any(noise.kinds for noise in noises))
         source = describe(table, open_pairs(FRAME_PX, options.radius_m[0])) | {"seed": options.seed}
-        plan = run.Plan(specs, options.radius_m, noises, options.seed, options.pictures)
+        plan = run.Plan(specs, options.radius_m, noises, options.seed, options.pictures, options.device)
         results = run.run(plan, open_pairs, source, options.out, "python -m sthn.evaluate " + shlex.join(words))
         made = tables.tables([results])
     except (ValueError, OSError) as error:

@@ -92,8 +92,8 @@ class Spec:
         """Whether each D_C has weights of its own."""
         return "{dc}" in self.what
 
-    def open(self, search_radius_m: float) -> Rival:
-        """The method for conditions of this D_C."""
+    def open(self, search_radius_m: float, device: str = "cpu") -> Rival:
+        """The method for conditions of this D_C. `device`: of a checkpoint; bundles and rivals run on the CPU."""
         what = self.what.replace("{dc}", f"{search_radius_m:g}")
         stages = self.options.get("stages")
         if stages not in (None, 1, 2):
@@ -102,7 +102,7 @@ class Spec:
             if self.kind == "bundle":
                 return BundleMethod(read_bundle(what), search_radius_m, stages == 1, self.label)
             if self.kind == "checkpoint":
-                return CheckpointMethod(_load(Path(what), self.options), self.label or _name_of(Path(what)))
+                return CheckpointMethod(_load(Path(what), self.options), self.label or _name_of(Path(what)), device=device)
             return _rival(what, self.label, self.options)
         except MethodError:
             raise
@@ -135,8 +135,8 @@ class CheckpointMethod:
 
     ready = True
 
-    def __init__(self, network: Sthn, name: str, note: str = "") -> None:
-        self.network, self.name, self.note = network.eval(), name, note
+    def __init__(self, network: Sthn, name: str, note: str = "", device: str = "cpu") -> None:
+        self.network, self.name, self.note, self.device = network.eval().to(device), name, note, device
         self.window_px, self.window_m = network.config.database_size, None
 
     def match(self, pair: Pair) -> StagedMatch:
@@ -146,15 +146,15 @@ class CheckpointMethod:
         clock = _StageClock(self.network)
         began = time.perf_counter()
         with clock, torch.inference_mode():
-            found = self.network(to_tensor(pair.satellite), to_tensor(pair.thermal))
-            final = found.final[0].double().numpy()
+            found = self.network(*(to_tensor(image).to(self.device) for image in (pair.satellite, pair.thermal)))
+            final = found.final[0].cpu().double().numpy()
         seconds = time.perf_counter() - began
 
         def quad(displacement: NDArray) -> geometry.Quad:
             inclusive = geometry.displaced(config.resize_width, displacement)
             return geometry.edges_of_inclusive(inclusive, config.alpha)
 
-        coarse = quad(found.coarse_iterations[-1, 0].double().numpy()) if found.box is not None else None
+        coarse = quad(found.coarse_iterations[-1, 0].cpu().double().numpy()) if found.box is not None else None
         return _answer(pair, quad(final), coarse, seconds, clock.detail())
 
 
@@ -242,10 +242,18 @@ class _StageClock:
             self.handles.append(module.register_forward_hook(lambda *_, n=name: self._stop(n)))
 
     def _start(self, name: str) -> None:
+        self._wait()
         self.spent[name] = -time.perf_counter()
 
     def _stop(self, name: str) -> None:
+        self._wait()
         self.spent[name] += time.perf_counter()
+
+    def _wait(self) -> None:
+        """A GPU works on after it was asked."""
+        device = next(self.stages["coarse"].parameters()).device
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
 
     def __exit__(self, *_: object) -> None:
         for handle in self.handles:

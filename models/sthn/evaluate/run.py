@@ -60,17 +60,19 @@ class Plan:
     noises: Sequence[Noise]
     seed: int
     pictures: int = 0
+    device: str = "cpu"
+    """Of checkpoints."""
 
 
 def run(plan: Plan, open_pairs: OpenPairs, source: dict[str, Any], out: Path, command: str) -> Results:
     """Runs the plan and writes `results.json` after every condition."""
-    results = Results(command, source | {"machine": machine()}, folder=out)
+    results = Results(command, source | {"machine": machine(plan.device)}, folder=out)
     opened: dict[str, Rival] = {}
     for radius in plan.radii_m:
         for spec in plan.specs:
             # Weights that are one for all conditions are read once; a bundle's search disc follows D_C.
             if spec.text not in opened or spec.by_radius or spec.kind == "bundle":
-                opened[spec.text] = spec.open(radius)
+                opened[spec.text] = spec.open(radius, plan.device)
         methods = [opened[spec.text] for spec in plan.specs]
         scale = float(source.get("m_per_px", 1.0))
         _add_methods(results, plan.specs, methods, scale)
@@ -129,11 +131,12 @@ def _quads(match: Match, pair: Pair) -> tuple[Quad | None, Quad | None]:
     return tuple(None if q is None or not np.isfinite(q).all() else relative_m(pair, q).round(3).tolist() for q in found)
 
 
-def machine() -> str:
+def machine(device: str = "cpu") -> str:
     """What latencies are of."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         model = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         model = platform.processor() or platform.machine()
-    return f"{model}, {os.cpu_count()} cores, {torch.get_num_threads()} threads"
+    gpu = f"; checkpoints on {torch.cuda.get_device_name(device)}" if device.startswith("cuda") else ""
+    return f"{model}, {os.cpu_count()} cores, {torch.get_num_threads()} threads{gpu}"
