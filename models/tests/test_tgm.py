@@ -252,6 +252,15 @@ def test_the_commands_go_together(scene: SceneMap, tmp_path: Path, capsys: pytes
     assert (error.argmin(1) == np.arange(9)).all()
     assert command.main(generated) == 2
     assert "expected one of --h5 and --thermal-map" in capsys.readouterr().err
+    files = [
+        "--h5",
+        str(tmp_path / "g/extended_queries_test_excluded.h5"),
+        "--database",
+        str(tmp_path / "g/extended_database.h5"),
+    ]
+    assert command.main([*generated[:4], str(path), *files, "--stride-px", "300", "--exclude", "0,300,0,1200"]) == 0
+    over_tif = open_source(extended | {"folder": "g", "map": "map.tif"}, root=tmp_path, purpose="train")
+    assert len(over_tif) == 6 and np.array_equal(over_tif[0].satellite, source[3].satellite)
     coarse = tmp_path / "coarse.tif"
     profile["transform"] = rasterio.transform.from_origin(3e5, 28e5, 1.1, 1.1)
     with rasterio.open(coarse, "w", driver="GTiff", height=1200, width=1200, count=3, dtype="uint8", **profile) as target:

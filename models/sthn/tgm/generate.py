@@ -116,6 +116,7 @@ def write_extended(
             for gray in paint(net, tiles, size_px, device):
                 yield gray if size_px == tile_px else cv2.resize(gray, (tile_px, tile_px), interpolation=cv2.INTER_LINEAR)
 
+    path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_suffix(".tmp")
     boson.write(unfinished, frames(), places)
     unfinished.replace(path)
