@@ -154,7 +154,7 @@ def refine_stage(folder: Path, picture: np.ndarray, frame: np.ndarray) -> Export
         "frame": input_spec(REFINE.frame_px, FRAME_WIDTH_M, "gray_mask", "half_pixel_antialias"),
         "lookup": "frame_indexed",
         "crop": {"shape": "oriented", "padding_m": (REFINE.map_width_m - FRAME_WIDTH_M) / 2},
-        "tolerance_px": 1e-3,
+        "tolerance_px": 4e-3,  # a centimetre on the ground; 1.1e-3 was seen between PyTorch and ONNX Runtime
         "match_sigma_m": MATCH_SIGMA_M["refine"],
     }
     inputs = {
