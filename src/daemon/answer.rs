@@ -80,7 +80,9 @@ pub fn answer_frames(
         };
         health.begin(job.arrived);
         let mut answer = answer(inbox, &job, camera, deadline, &mut locate);
-        guard.judge(job.stamp_ns, job.frame.as_ref().ok().map(|frame| frame.bytes.as_slice()), &mut answer);
+        let external = lock(&inbox.tracker).external_at(job.stamp_ns);
+        let bytes = job.frame.as_ref().ok().map(|frame| frame.bytes.as_slice());
+        guard.judge(job.stamp_ns, bytes, external.as_ref(), &mut answer);
         lock(&inbox.tracker).record(job.stamp_ns, seq, &answer);
         let reason = answer.outcome.as_ref().err().map(|no_fix| no_fix.reason);
         outbox.push(FixMessage::new(job.stamp_ns, seq, &answer, &identity.bundle, &identity.map), health);

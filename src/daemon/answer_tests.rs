@@ -215,6 +215,39 @@ fn the_echo_of_our_own_fix_is_known_and_its_depth_is_said() {
     assert_eq!(prior(3), ("external".into(), 0.into()));
 }
 
+/// A picture that stands still with bytes that change: the answer is one place for ever, by way of own fixes.
+#[test]
+fn an_external_prior_ends_a_chain_of_own_fixes() {
+    let bench = bench(LONG);
+    let home = LatLon { lat_deg: 25.0, lon_deg: 55.0 };
+    let hertz4 = (0..40).map(|i: i64| {
+        if i % 4 == 0 {
+            // 20 m/s to the north, known to 100 m.
+            let position = home.offset(crate::geo::Enu { east_m: 0.0, north_m: 5.0 * i as f64 });
+            let known = PriorReport { position, spread: Spread::RadiusM(100.0), ..prior(S + i * S / 4) };
+            assert!(lock(&bench.inbox.tracker).report(known));
+        }
+        let frame = FrameBytes { bytes: vec![i as u8], encoding: Encoding::Png, size_px: (640, 512) };
+        Job { frame: Ok(frame), ..job(S + i * S / 4) }
+    });
+    let messages = bench.answer(hertz4, LONG, |query| {
+        let mut answer = locate(query);
+        let reach_m = query.prior.as_ref().map_or(0.0, |prior| prior.position.distance_m(home) - prior.radius_m);
+        match &mut answer.outcome {
+            Ok(fix) if reach_m <= 0.0 => fix.position = home,
+            _ => answer.outcome = Err(NoFix::new(Reason::OutsidePrior, "")),
+        }
+        answer
+    });
+    // 25 x 0.5 m of growth on top of the bound, at most.
+    for message in &messages[24..] {
+        assert!(message.reason.is_some(), "{message:?}");
+    }
+    let held = messages.iter().find(|m| m.reason == Some(Reason::HeldBack)).unwrap();
+    assert!(held.detail.as_deref().unwrap().contains("external prior"), "{held:?}");
+    assert_eq!(messages[39].prior.unwrap().source, PriorSource::External, "the chain is given up");
+}
+
 #[test]
 fn what_the_guard_holds_back_is_said_and_becomes_no_prior() {
     let bench = bench(LONG);

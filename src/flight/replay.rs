@@ -71,7 +71,8 @@ pub fn replay<E>(
             prior: prior(row, &mut tracker),
         };
         let mut answer = localizer.locate(&query);
-        guard.judge(row.stamp_ns, query.frame.as_ref().ok().map(|frame| frame.bytes), &mut answer);
+        let bytes = query.frame.as_ref().ok().map(|frame| frame.bytes);
+        guard.judge(row.stamp_ns, bytes, tracker.external_at(row.stamp_ns).as_ref(), &mut answer);
         tracker.record(row.stamp_ns, seq, &answer);
         unreadable += usize::from(is_unreadable(&query.frame, &answer));
         let message = FixMessage::new(row.stamp_ns, seq, &answer, &bundle, &map);

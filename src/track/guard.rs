@@ -4,11 +4,13 @@
 //! 1. The same picture again, bit for bit, at another exposure: its fix holds for the first exposure, so its stated error
 //!    grows by `max_speed_mps` x the time since; from `frozen_frames` in a row, over `frozen_after_s`, on it is
 //!    `held_back`.
-//! 2. A fix further from the published one nearest in time than motion allows is `held_back`; but not where a new external
+//! 2. A fix outside the disc of the external prior nearest in time, grown by its age, is `held_back`, whichever prior led to
+//!    it: a chain of own fixes does not outlive what others know. It confirms nothing.
+//! 3. A fix further from the published one nearest in time than motion allows is `held_back`; but not where a new external
 //!    prior came with it from a source that jumps itself (independent places, a restarted estimator). A source is taken as
 //!    continuous where its last `steady_reports` steps were such as the vehicle can fly.
-//! 3. A fix that was searched for beyond the bundle's D_C is always held back, 2. or not.
-//! 4. What 2. and 3. hold back is published where `confirmations` earlier answers of other ground agree with it: of other
+//! 4. A fix that was searched for beyond the bundle's D_C is always held back, 3. or not.
+//! 5. What 3. and 4. hold back is published where `confirmations` earlier answers of other ground agree with it: of other
 //!    ground, so that one picture does not confirm itself; for a searched one only where agreement by chance is rare.
 //!
 //! Goes between [`crate::locate::Localizer`] and [`super::Tracker::record`]: what is held back becomes no own prior. No
@@ -26,6 +28,8 @@ use std::collections::VecDeque;
 const KEPT: usize = 16;
 /// Stamps of one report, computed from its age, differ by rounding only.
 const SAME_REPORT_NS: u64 = 1_000;
+/// Of a distance, relative.
+const ROUNDING: f64 = 1e-9;
 
 /// An external prior, as the frames that used it tell.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -73,9 +77,9 @@ impl Guard {
         Self { settings, enabled, published, held, reports: VecDeque::new(), picture: None }
     }
 
-    /// Judges the answer for a frame exposed at `stamp_ns` (`frame`: its bytes as they came, where it has any): a fix may
-    /// become `held_back`, or its stated error wider.
-    pub fn judge(&mut self, stamp_ns: i64, frame: Option<&[u8]>, answer: &mut Answer) {
+    /// Judges the answer for a frame exposed at `stamp_ns` (`frame`: its bytes as they came, where it has any; `external`:
+    /// [`super::Tracker::external_at`] by then): a fix may become `held_back`, or its stated error wider.
+    pub fn judge(&mut self, stamp_ns: i64, frame: Option<&[u8]>, external: Option<&Prior>, answer: &mut Answer) {
         if !self.enabled {
             return;
         }
@@ -87,6 +91,10 @@ impl Guard {
                 "frame: expected a new picture, found the same one bit for bit, {repeats} in a row over {picture_age_s:.3} s: \
                  the camera is frozen"
             );
+            answer.outcome = Err(NoFix::new(Reason::HeldBack, detail));
+            return;
+        }
+        if let Some(detail) = external.and_then(|external| contradicts(external, fix.position)) {
             answer.outcome = Err(NoFix::new(Reason::HeldBack, detail));
             return;
         }
@@ -226,6 +234,16 @@ impl Guard {
         });
         steps.count() >= self.settings.steady_reports as usize
     }
+}
+
+/// The words where a fix lies outside what an external prior allows.
+fn contradicts(external: &Prior, position: LatLon) -> Option<String> {
+    let (radius_m, distance_m) = (external.radius_m, external.position.distance_m(position));
+    let within = distance_m <= radius_m * (1.0 + ROUNDING);
+    let age_s = external.age_s.unwrap_or(0.0);
+    (!within).then(|| {
+        format!("distance from the external prior of {age_s:.2} s before: expected at most {radius_m:.1} m, found {distance_m:.1} m")
+    })
 }
 
 /// Whether two are one report.

@@ -61,7 +61,7 @@ fn searched(at: LatLon, radius_m: f64) -> Answer {
 
 /// What becomes of an answer whose picture is a new one.
 fn judge(guard: &mut Guard, stamp_ns: i64, mut answer: Answer) -> Result<Fix, NoFix> {
-    guard.judge(stamp_ns, None, &mut answer);
+    guard.judge(stamp_ns, None, None, &mut answer);
     answer.outcome
 }
 
@@ -177,7 +177,7 @@ fn a_searched_place_needs_a_second_frame_of_other_ground() {
     assert!(judge(&mut guard, T0 + S, searched(near(1.0), 3000.0)).is_err(), "20 m and 1 s: the same ground");
     assert!(judge(&mut guard, T0 + 2 * S, searched(place(-900.0, 500.0), 3000.0)).is_err(), "elsewhere");
     let mut second = searched(near(3.0), 3000.0);
-    guard.judge(T0 + 3 * S, None, &mut second);
+    guard.judge(T0 + 3 * S, None, None, &mut second);
     assert!(second.outcome.is_ok() && second.searched);
     // A published fix confirms too; and what was not searched for needs none.
     assert!(judge(&mut guard, T0 + 6 * S, searched(near(6.0), 3000.0)).is_ok());
@@ -200,7 +200,7 @@ fn agreement_that_chance_gives_confirms_no_search() {
 
 fn look(guard: &mut Guard, stamp_ns: i64, picture: &[u8]) -> Answer {
     let mut answer = answer(place(0.0, 0.0), own(place(0.0, 0.0)));
-    guard.judge(stamp_ns, Some(picture), &mut answer);
+    guard.judge(stamp_ns, Some(picture), None, &mut answer);
     answer
 }
 
@@ -244,7 +244,7 @@ fn switched_off_it_changes_nothing() {
     for i in 0..5 {
         let before = Answer { searched: true, ..answer(place(5000.0 * i as f64, 0.0), own(place(0.0, 0.0))) };
         let mut after = before.clone();
-        guard.judge(T0 + i * S, Some(b"same"), &mut after);
+        guard.judge(T0 + i * S, Some(b"same"), Some(&external(place(0.0, 0.0), 10.0, 0.0)), &mut after);
         assert_eq!(before, after);
     }
 }
@@ -258,11 +258,32 @@ fn what_is_held_back_is_no_prior() {
     for (seq, east_m) in [(0, 0.0), (1, 400.0)] {
         let stamp_ns = T0 + i64::try_from(seq).unwrap() * S;
         let mut answer = answer(place(east_m, 0.0), tracker.prior_at(stamp_ns).unwrap());
-        guard.judge(stamp_ns, None, &mut answer);
+        guard.judge(stamp_ns, None, None, &mut answer);
         tracker.record(stamp_ns, seq, &answer);
     }
     let prior = tracker.prior_at(T0 + 2 * S).unwrap();
     assert_eq!((prior.source, prior.position), (PriorSource::OwnFix, place(0.0, 0.0)));
+}
+
+#[test]
+fn a_fix_outside_the_external_disc_is_held_back_and_confirms_nothing() {
+    let mut guard = guard();
+    let stale = answer(place(0.0, 0.0), own(place(0.0, 0.0)));
+    let bound = |east_m: f64, radius_m: f64| external(place(east_m, 0.0), radius_m, 0.25);
+    let judge = |guard: &mut Guard, i: i64, bound: Prior| {
+        let mut answer = stale.clone();
+        guard.judge(T0 + i * 4 * S, None, Some(&bound), &mut answer);
+        answer.outcome
+    };
+    assert!(judge(&mut guard, 0, bound(99.9, 100.0)).is_ok());
+    for i in 1..4 {
+        let refused = judge(&mut guard, i, bound(101.0, 100.0)).unwrap_err();
+        assert_eq!(refused.reason, Reason::HeldBack);
+        assert!(refused.detail.contains("external prior of 0.25 s before") && refused.detail.contains("found 101"), "{}", refused.detail);
+    }
+    assert!(guard.held.newest_first().next().is_none());
+    assert!(judge(&mut guard, 4, bound(300.0, 400.0)).is_ok(), "an old prior has a wide disc");
+    assert!(judge(&mut guard, 5, bound(0.0, f64::NAN)).is_err());
 }
 
 #[test]

@@ -133,7 +133,7 @@ impl Tracker {
     /// "no fix" or 30 s the last external one, grown by its age. `no_prior` or `stale_prior` where there is none.
     pub fn prior_at(&self, stamp_ns: i64) -> Result<Prior, NoFix> {
         let nearest_external = self.external.nearest(stamp_ns);
-        let external = nearest_external.filter(|(at, _)| age_s(stamp_ns, *at).abs() <= self.settings.max_prior_age_s);
+        let external = self.fresh_external(stamp_ns);
         let own = self
             .own
             .nearest(stamp_ns)
@@ -161,6 +161,16 @@ impl Tracker {
                 None => NoFix { reason: Reason::NoPrior, detail: "prior: expected one from outside, found none".to_owned() },
             }),
         }
+    }
+
+    /// The external prior nearest to `stamp_ns`, grown to it, where it is not stale: no fix may lie outside its disc, whichever
+    /// prior led to the fix.
+    pub fn external_at(&self, stamp_ns: i64) -> Option<Prior> {
+        self.fresh_external(stamp_ns).map(|(at, known)| self.grown(stamp_ns, at, known))
+    }
+
+    fn fresh_external(&self, stamp_ns: i64) -> Option<(i64, &Known)> {
+        self.external.nearest(stamp_ns).filter(|(at, _)| age_s(stamp_ns, *at).abs() <= self.settings.max_prior_age_s)
     }
 
     /// An answer was given for a frame exposed at `stamp_ns`, with message number `seq`.

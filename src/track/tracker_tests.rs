@@ -190,6 +190,20 @@ fn a_newer_external_prior_wins_over_the_own_fix() {
 }
 
 #[test]
+fn the_external_prior_is_known_beside_the_own_fix() {
+    let mut tracker = tracker();
+    assert_eq!(tracker.external_at(T0), None);
+    tracker.report(sigma(T0, 0.0, 10.0));
+    tracker.record(T0, 40, &fix(70.0, 3.0, None));
+    // An echo is no external prior.
+    tracker.report(PriorReport { fix_seq: Some(40), ..sigma(T0 + S, 90.0, 2.0) });
+    let prior = tracker.external_at(T0 + 2 * S).unwrap();
+    assert_eq!((prior.source, prior.position, prior.age_s), (PriorSource::External, place(0.0), Some(2.0)));
+    close(prior.radius_m, 180.0);
+    assert_eq!(tracker.external_at(T0 + 601 * S), None, "stale");
+}
+
+#[test]
 fn of_two_priors_one_that_can_be_searched_is_taken() {
     let after = T0 + 49 * S / 10;
     let own_then = |external_m: f64| {
