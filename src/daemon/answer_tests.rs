@@ -73,11 +73,20 @@ impl Bench {
         deadline: Duration,
         locate: impl FnMut(&Query<'_>) -> Answer + Send,
     ) -> Vec<FixMessage> {
-        let camera = CameraModel::default();
+        self.answer_with(&Settings::defaults().unwrap(), jobs, deadline, locate)
+    }
+
+    fn answer_with(
+        &self,
+        settings: &Settings,
+        jobs: impl IntoIterator<Item = Job>,
+        deadline: Duration,
+        locate: impl FnMut(&Query<'_>) -> Answer + Send,
+    ) -> Vec<FixMessage> {
         let mut messages = Vec::new();
         std::thread::scope(|scope| {
-            let guard = Guard::new(Settings::defaults().unwrap().track, true);
-            scope.spawn(|| answer_frames(&self.inbox, &self.outbox, &self.health, &camera, deadline, guard, locate));
+            let guard = Guard::new(settings.track.clone(), true);
+            scope.spawn(|| answer_frames(&self.inbox, &self.outbox, &self.health, settings, deadline, guard, locate));
             for job in jobs {
                 let seq = self.outbox.last().message.seq;
                 assert!(self.inbox.frames.push(job).is_none());
@@ -175,6 +184,41 @@ fn the_pose_comes_from_the_frame_then_from_the_attitude() {
     assert_eq!((seen[0].yaw_deg, seen[0].hfov_deg, seen[0].agl_m), (Some(5.0), Some(40.0), Some(400.0)));
     assert!((seen[0].pitch_deg.unwrap() - 2.0).abs() < 1e-9);
     assert_eq!(seen[1], Pose::default(), "too old is unknown");
+}
+
+#[test]
+fn a_tilted_mount_without_an_attitude_counts_and_its_tilt_is_not_known() {
+    let bench = bench(LONG);
+    lock(&bench.inbox.tracker).report(prior(S));
+    lock(&bench.inbox.attitudes).push(crate::bus::AttitudeMessage {
+        stamp_ns: 2 * S,
+        roll_deg: 1.0,
+        pitch_deg: 2.0,
+        yaw_deg: 30.0,
+        agl_m: None,
+    });
+    let picture = |i: i64, stated: Pose| {
+        let frame = FrameBytes { bytes: vec![i as u8], encoding: Encoding::Png, size_px: (640, 512) };
+        Job { frame: Ok(frame), stated, ..job(i * S) }
+    };
+    let half = Pose { pitch_deg: Some(10.0), ..Pose::default() };
+    let whole = Pose { roll_deg: Some(0.0), ..half };
+    let jobs = vec![picture(1, Pose::default()), picture(2, Pose::default()), picture(3, half), picture(4, whole)];
+    let mut settings = Settings::defaults().unwrap();
+    settings.camera.mount_pitch_deg = 10.0;
+    let pitches = Mutex::new(Vec::new());
+    let messages = bench.answer_with(&settings, jobs, LONG, |query| {
+        lock(&pitches).push(query.pose.pitch_deg.unwrap());
+        let mut answer = locate(query);
+        answer.evidence.insert("tilt_lever_m".to_owned(), 400.0);
+        answer.evidence.insert("sigma_tilt_m".to_owned(), 400.0 * 0.5_f64.to_radians());
+        answer
+    });
+    let pitches: Vec<i64> = pitches.into_inner().unwrap().iter().map(|p| p.round() as i64).collect();
+    assert_eq!(pitches, [10, 12, 10, 10]);
+    let tilts: Vec<i64> = messages.iter().map(|m| (m.evidence["sigma_tilt_m"] * 10.0).round() as i64).collect();
+    assert_eq!(tilts, [140, 35, 140, 35]);
+    assert!(messages[0].covariance_enu_m2.unwrap()[0][0] > messages[1].covariance_enu_m2.unwrap()[0][0]);
 }
 
 /// Through two real messages: what we publish, and what an estimator makes of it.

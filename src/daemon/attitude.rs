@@ -41,13 +41,13 @@ impl Attitudes {
 }
 
 /// The camera's pose at exposure: what the frame states (it speaks of the camera), else what the vehicle's attitude
-/// and the mount give, else the configured field of view, else unknown.
+/// and the mount give (of a vehicle whose attitude is unknown: level), else the configured field of view, else unknown.
 pub fn camera_pose(stated: &Pose, vehicle: Option<&Pose>, camera: &CameraModel) -> Pose {
-    let derived = vehicle.map(|vehicle| camera.camera_pose(vehicle)).unwrap_or_default();
+    let derived = camera.camera_pose(&vehicle.copied().unwrap_or_default());
     Pose {
         agl_m: stated.agl_m.or(derived.agl_m),
         gsd_m: stated.gsd_m,
-        hfov_deg: stated.hfov_deg.or(camera.hfov_deg),
+        hfov_deg: stated.hfov_deg.or(derived.hfov_deg),
         yaw_deg: stated.yaw_deg.or(derived.yaw_deg),
         pitch_deg: stated.pitch_deg.or(derived.pitch_deg),
         roll_deg: stated.roll_deg.or(derived.roll_deg),
@@ -166,5 +166,18 @@ mod tests {
         assert_eq!(pose.gsd_m, None);
         let pose = camera_pose(&Pose { hfov_deg: Some(20.0), ..Pose::default() }, None, &camera);
         assert_eq!(pose, Pose { hfov_deg: Some(20.0), ..Pose::default() });
+    }
+
+    #[test]
+    fn a_tilted_mount_counts_without_an_attitude() {
+        let camera = CameraModel { mount_pitch_deg: 10.0, mount_roll_deg: -4.0, ..CameraModel::default() };
+        let pose = camera_pose(&Pose::default(), None, &camera);
+        close(pose.pitch_deg, 10.0);
+        close(pose.roll_deg, -4.0);
+        assert_eq!(pose.yaw_deg, None);
+        let stated = Pose { pitch_deg: Some(1.0), ..Pose::default() };
+        let pose = camera_pose(&stated, None, &camera);
+        close(pose.pitch_deg, 1.0);
+        close(pose.roll_deg, -4.0);
     }
 }
