@@ -145,6 +145,17 @@ mod tests {
     }
 
     #[test]
+    fn after_a_step_back_nothing_of_the_future_is_left() {
+        // 20 Hz, 5 s of it; then the clock is 2 s back, and the vehicle looks the other way.
+        let before: Vec<_> = (0..100).map(|i| message(50 * i, 90.0, 0.0, None)).collect();
+        let mut attitudes = attitudes(&before);
+        attitudes.push(message(2960, 270.0, 0.0, None));
+        attitudes.push(message(3010, 270.0, 0.0, None));
+        close(attitudes.at(T0 + 3000 * MS).unwrap().yaw_deg, 270.0);
+        close(attitudes.at(T0 + 3050 * MS).unwrap().yaw_deg, 270.0);
+    }
+
+    #[test]
     fn one_side_too_old_leaves_the_other() {
         let attitudes = attitudes(&[message(0, 10.0, 0.0, None), message(500, 50.0, 0.0, None)]);
         close(attitudes.at(T0 + 150 * MS).unwrap().yaw_deg, 10.0);

@@ -8,7 +8,9 @@
 //! 3. Of the two the one nearer to t is taken (at a tie the one that came later); but the other one where the first is
 //!    wider than the bundle can search and the other is not.
 //!
-//! Nothing here reads a clock: time is what stamps say, so a clock that steps costs at most the priors it makes stale.
+//! Nothing here reads a clock: time is what stamps say. A clock that steps forward costs the priors that it makes stale. One
+//! that steps back costs what is stamped later than the first report or fix after it (over a second: less is disorder);
+//! until that comes, the age of what is known is the stamps' difference, not the time that passed.
 
 use super::recent::Recent;
 use crate::config::TrackSettings;

@@ -264,10 +264,10 @@ fn an_echo_of_an_unknown_fix_counts_as_one_deep() {
 fn order_of_arrival_does_not_matter_and_the_future_grows_too() {
     let mut tracker = tracker();
     tracker.report(radius(T0 + 10 * S, 10.0, 100.0));
-    tracker.report(radius(T0, 0.0, 100.0));
+    tracker.report(radius(T0 + 9 * S, 0.0, 100.0));
     assert_eq!(tracker.prior_at(T0 + 11 * S).unwrap().position, place(10.0));
-    let prior = tracker.prior_at(T0 + 8 * S).unwrap();
-    assert_eq!((prior.position, prior.age_s), (place(10.0), Some(-2.0)));
+    let prior = tracker.prior_at(T0 + 7 * S).unwrap();
+    assert_eq!((prior.position, prior.age_s), (place(0.0), Some(-2.0)));
     close(prior.radius_m, 150.0);
 }
 
@@ -280,6 +280,24 @@ fn a_clock_that_steps_back_leaves_the_future_behind() {
     assert_eq!(tracker.prior_at(T0).unwrap_err().reason, Reason::StalePrior);
     tracker.report(radius(T0, 5.0, 100.0));
     assert_eq!(tracker.prior_at(T0).unwrap().position, place(5.0));
+}
+
+#[test]
+fn a_small_step_back_leaves_no_future_that_wins_by_stamp() {
+    let mut tracker = tracker();
+    for i in 0..30 {
+        let (stamp_ns, east_m) = (T0 + i * S, 20.0 * i as f64);
+        tracker.report(radius(stamp_ns, east_m, 100.0));
+        tracker.record(stamp_ns, i as u64, &fix(east_m, 3.0, None));
+    }
+    // 10 s back, while the vehicle goes on: nothing of the last flight between T0 + 20 s and T0 + 30 s holds now.
+    tracker.report(radius(T0 + 20 * S, 620.0, 100.0));
+    tracker.record(T0 + 20 * S, 30, &fix(620.0, 3.0, None));
+    for i in 20..30 {
+        let prior = tracker.prior_at(T0 + i * S).unwrap();
+        assert_eq!(prior.position, place(620.0));
+        assert_eq!(tracker.external_at(T0 + i * S).unwrap().position, place(620.0));
+    }
 }
 
 #[test]
