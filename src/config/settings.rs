@@ -118,7 +118,7 @@ pub struct TrackSettings {
     /// Steps between external priors, all such as the vehicle can fly, after which their source is taken as continuous: then
     /// it explains no jump of a fix.
     pub steady_reports: u32,
-    /// The same picture so many times in a row is `held_back`,
+    /// The same picture so many times, among the last 16, is `held_back`,
     pub frozen_frames: u32,
     /// where the first and the last are at least this far apart, seconds: some streams repeat a slow camera's pictures.
     pub frozen_after_s: f64,

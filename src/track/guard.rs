@@ -1,8 +1,8 @@
 //! Consistency over frames: what no motion explains is held back until another frame agrees, a frozen picture is no news.
 //!
 //! Rules, each about one answer, in the order in which they are tested:
-//! 1. The same picture again, bit for bit, at another exposure: its fix holds for the first exposure, so its stated error
-//!    grows by `max_speed_mps` x the time since; from `frozen_frames` in a row, over `frozen_after_s`, on it is
+//! 1. One of the last few pictures again, bit for bit, at another exposure: its fix holds for the first exposure, so its stated
+//!    error grows by `max_speed_mps` x the time since; from the `frozen_frames`-th exposure, over `frozen_after_s`, on it is
 //!    `held_back`.
 //! 2. A fix outside the disc of the external prior nearest in time, grown by its age, is `held_back`, whichever prior led to
 //!    it: a chain of own fixes does not outlive what others know. It confirms nothing.
@@ -26,6 +26,8 @@ use std::collections::VecDeque;
 
 /// Published and held answers kept of each: enough for frames that come out of order.
 const KEPT: usize = 16;
+/// Pictures remembered: enough for a driver that goes round in its buffers.
+const PICTURES: usize = 16;
 /// Stamps of one report, computed from its age, differ by rounding only.
 const SAME_REPORT_NS: u64 = 1_000;
 /// Of a distance, relative.
@@ -48,13 +50,13 @@ struct Place {
     report: Option<Report>,
 }
 
-/// The picture last seen, and since when.
+/// A picture, and since when it is seen.
 #[derive(Debug, Clone)]
 struct Picture {
     digest: [u8; 32],
     first_stamp_ns: i64,
     last_stamp_ns: i64,
-    /// In a row, at different exposures.
+    /// At different exposures.
     count: u32,
 }
 
@@ -67,14 +69,15 @@ pub struct Guard {
     held: Recent<Place>,
     /// External reports in the order of their stamps, the last few.
     reports: VecDeque<Report>,
-    picture: Option<Picture>,
+    /// The last to be seen at the back.
+    pictures: VecDeque<Picture>,
 }
 
 impl Guard {
     /// Nothing seen yet. Not `enabled` (gates off): nothing is held back.
     pub fn new(settings: TrackSettings, enabled: bool) -> Self {
         let (published, held) = (Recent::new(KEPT), Recent::new(KEPT));
-        Self { settings, enabled, published, held, reports: VecDeque::new(), picture: None }
+        Self { settings, enabled, published, held, reports: VecDeque::new(), pictures: VecDeque::new() }
     }
 
     /// Judges the answer for a frame exposed at `stamp_ns` (`frame`: its bytes as they came, where it has any; `external`:
@@ -88,7 +91,7 @@ impl Guard {
         let Ok(fix) = &mut answer.outcome else { return };
         if repeats >= self.settings.frozen_frames && picture_age_s >= self.settings.frozen_after_s {
             let detail = format!(
-                "frame: expected a new picture, found the same one bit for bit, {repeats} in a row over {picture_age_s:.3} s: \
+                "frame: expected a new picture, found the same one bit for bit at {repeats} exposures over {picture_age_s:.3} s: \
                  the camera is frozen"
             );
             answer.outcome = Err(NoFix::new(Reason::HeldBack, detail));
@@ -178,24 +181,25 @@ impl Guard {
         settings.max_speed_mps * age_s(a_ns, b_ns).abs() + 3.0 * (a.sigma_m + b.sigma_m) + settings.jump_slack_m
     }
 
-    /// Remembers the picture; how many in a row it was seen, at different exposures, and the seconds since the first.
+    /// Remembers the picture; at how many exposures it was seen, and the seconds since the first. Where there is none, what was
+    /// seen stays.
     fn look(&mut self, stamp_ns: i64, frame: Option<&[u8]>) -> (u32, f64) {
-        let Some(bytes) = frame else {
-            self.picture = None;
-            return (0, 0.0);
-        };
+        let Some(bytes) = frame else { return (0, 0.0) };
         let digest: [u8; 32] = Sha256::digest(bytes).into();
-        let Some(seen) = self.picture.as_mut().filter(|seen| seen.digest == digest) else {
-            self.picture = Some(Picture { digest, first_stamp_ns: stamp_ns, last_stamp_ns: stamp_ns, count: 1 });
-            return (1, 0.0);
-        };
+        let known = self.pictures.iter().position(|seen| seen.digest == digest).and_then(|i| self.pictures.remove(i));
+        let mut seen = known.unwrap_or(Picture { digest, first_stamp_ns: stamp_ns, last_stamp_ns: stamp_ns, count: 1 });
         // One exposure sent twice is no frozen camera.
         if seen.last_stamp_ns != stamp_ns {
             seen.count = seen.count.saturating_add(1);
             seen.last_stamp_ns = stamp_ns;
         }
         let count = if seen.first_stamp_ns == stamp_ns { 1 } else { seen.count };
-        (count, age_s(stamp_ns, seen.first_stamp_ns).abs())
+        let age_s = age_s(stamp_ns, seen.first_stamp_ns).abs();
+        self.pictures.push_back(seen);
+        if self.pictures.len() > PICTURES {
+            self.pictures.pop_front();
+        }
+        (count, age_s)
     }
 
     /// Remembers the external report that a prior rests on, and gives it.

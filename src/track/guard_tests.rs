@@ -219,9 +219,24 @@ fn a_frozen_camera_widens_then_closes_and_a_new_picture_opens() {
         assert!(refused.detail.contains("frozen"), "{}", refused.detail);
     }
     assert!(look(&mut guard, T0 + 6 * S, b"two").outcome.unwrap().calibrated);
-    // Not in a row: a file that comes up again much later is a picture as any.
+    // It is remembered over others and over frames without bytes, until 16 others were seen since.
+    assert_eq!(look(&mut guard, T0 + 7 * S, b"one").outcome.unwrap_err().reason, Reason::HeldBack);
+    let mut none = answer(place(0.0, 0.0), own(place(0.0, 0.0)));
+    guard.judge(T0 + 8 * S, None, None, &mut none);
+    assert_eq!(look(&mut guard, T0 + 9 * S, b"one").outcome.unwrap_err().reason, Reason::HeldBack);
+    for i in 0..16 {
+        assert!(look(&mut guard, T0 + (10 + i) * S, &[i as u8]).outcome.unwrap().calibrated);
+    }
     assert!(look(&mut guard, T0 + 900 * S, b"one").outcome.unwrap().calibrated);
-    assert!(look(&mut guard, T0 + 901 * S, b"two").outcome.unwrap().calibrated);
+}
+
+#[test]
+fn a_driver_that_goes_round_in_its_buffers_is_frozen_too() {
+    let mut guard = Guard::new(TrackSettings { frozen_frames: 10, ..settings() }, true);
+    let outcomes: Vec<_> = (0..40).map(|i: i64| look(&mut guard, T0 + i * S / 9, &[(i % 3) as u8]).outcome).collect();
+    assert!(outcomes[..3].iter().all(|outcome| outcome.as_ref().unwrap().calibrated));
+    assert!(outcomes[3..27].iter().all(|outcome| !outcome.as_ref().unwrap().calibrated));
+    assert!(outcomes[27..].iter().all(|outcome| outcome.as_ref().unwrap_err().detail.contains("frozen")));
 }
 
 #[test]
