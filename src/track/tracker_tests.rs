@@ -241,15 +241,57 @@ fn an_echo_is_own_influence_not_an_external_prior() {
 }
 
 #[test]
-fn an_echo_of_a_fix_given_up_is_not_believed() {
+fn an_echo_of_a_fix_given_up_grows_since_that_fix_and_comes_last() {
     let mut tracker = tracker();
     tracker.report(radius(T0, 0.0, 300.0));
     tracker.record(T0, 0, &fix(70.0, 3.0, None));
     for seq in 1..=5 {
         tracker.record(T0, seq, &no_fix());
     }
-    assert!(!tracker.report(PriorReport { fix_seq: Some(0), ..sigma(T0 + S, 90.0, 2.0) }));
-    assert_eq!(tracker.prior_at(T0 + S).unwrap().source, PriorSource::External);
+    let echo = |at_s: i64| PriorReport { fix_seq: Some(0), ..sigma(T0 + at_s * S, 90.0, 2.0) };
+    assert!(tracker.report(echo(4)));
+    assert_eq!(tracker.prior_at(T0 + 4 * S).unwrap().source, PriorSource::External, "400 m can be searched");
+    // An external prior that cannot be searched any more gives way; 3 x (50 + 25 x 4 + 25) m can.
+    tracker.report(radius(T0 + 4 * S, 0.0, 600.0));
+    let prior = tracker.prior_at(T0 + 4 * S + S / 2).unwrap();
+    assert_eq!((prior.source, prior.chain, prior.position), (PriorSource::OwnFix, 2, place(90.0)));
+    close(prior.radius_m, 3.0 * (50.0 + 100.0 + 12.5));
+    // It vouches for nothing, and a fix of our own goes first again.
+    assert_eq!(tracker.external_at(T0 + 4 * S).unwrap().position, place(0.0));
+    tracker.record(T0 + 4 * S, 6, &fix(71.0, 3.0, Some(prior)));
+    assert!(tracker.report(echo(5)));
+    assert_eq!(tracker.prior_at(T0 + 5 * S).unwrap().position, place(71.0));
+    // However long the estimator has no newer fix of ours to state, it is heard.
+    for seq in 7..=11 {
+        tracker.record(T0 + 5 * S, seq, &no_fix());
+    }
+    let bound = PriorReport { fix_seq: Some(0), ..radius(T0 + 900 * S, 95.0, 200.0) };
+    assert!(tracker.report(bound));
+    let prior = tracker.prior_at(T0 + 900 * S).unwrap();
+    assert_eq!((prior.position, prior.radius_m), (place(95.0), 200.0 + 25.0 * 900.0));
+}
+
+#[test]
+fn an_echo_of_a_fix_that_is_forgotten_is_refused() {
+    let mut tracker = tracker();
+    for seq in 100..200 {
+        tracker.record(T0, seq, &fix(70.0, 3.0, None));
+    }
+    let echo = |seq| PriorReport { fix_seq: Some(seq), ..sigma(T0, 90.0, 60.0) };
+    assert!(!tracker.report(echo(135)), "of the 64 kept 136 is the oldest");
+    assert!(tracker.report(echo(136)));
+}
+
+#[test]
+fn an_echo_of_an_unknown_fix_is_not_believed_after_a_loss() {
+    let mut tracker = tracker();
+    let echo = PriorReport { fix_seq: Some(9000), ..sigma(T0, 90.0, 60.0) };
+    assert!(tracker.report(echo));
+    for seq in 1..=5 {
+        tracker.record(T0, seq, &no_fix());
+    }
+    assert!(!tracker.report(echo));
+    assert_eq!(tracker.prior_at(T0).unwrap_err().reason, Reason::NoPrior);
 }
 
 #[test]
