@@ -109,7 +109,7 @@ pub struct TrackSettings {
     pub confirmations: u32,
     /// Answers this far apart are of other ground, metres.
     pub confirm_distance_m: f64,
-    /// Answers this much apart in time are of other ground, seconds.
+    /// A jump (not what a search found) is also confirmed by answers this much apart in time, seconds: not calibrated.
     pub confirm_after_s: f64,
     /// Answers further apart in time do not confirm each other, seconds.
     pub confirm_within_s: f64,

@@ -11,7 +11,9 @@
 //!    continuous where its last `steady_reports` steps were such as the vehicle can fly.
 //! 4. A fix that was searched for beyond the bundle's D_C is always held back, 3. or not.
 //! 5. What 3. and 4. hold back is published where `confirmations` earlier answers of other ground agree with it: of other
-//!    ground, so that one picture does not confirm itself; for a searched one only where agreement by chance is rare.
+//!    ground, so that one picture does not confirm itself; for a searched one only where agreement by chance is rare. A jump
+//!    is published as well where time alone lies between (`confirm_after_s`: a vehicle may hover), but no calibration
+//!    covers it, nor what follows until the vehicle is on other ground. What a search found for a vehicle that hovers stays held back.
 //!
 //! Goes between [`crate::locate::Localizer`] and [`super::Tracker::record`]: what is held back becomes no own prior. No
 //! clock: time is what stamps say, in whatever order they come.
@@ -67,6 +69,8 @@ pub struct Guard {
     enabled: bool,
     published: Recent<Place>,
     held: Recent<Place>,
+    /// Where a jump was published that time alone confirmed, until the vehicle is on other ground.
+    doubtful: Option<LatLon>,
     /// External reports in the order of their stamps, the last few.
     reports: VecDeque<Report>,
     /// The last to be seen at the back.
@@ -77,7 +81,7 @@ impl Guard {
     /// Nothing seen yet. Not `enabled` (gates off): nothing is held back.
     pub fn new(settings: TrackSettings, enabled: bool) -> Self {
         let (published, held) = (Recent::new(KEPT), Recent::new(KEPT));
-        Self { settings, enabled, published, held, reports: VecDeque::new(), pictures: VecDeque::new() }
+        Self { settings, enabled, published, held, doubtful: None, reports: VecDeque::new(), pictures: VecDeque::new() }
     }
 
     /// Judges the answer for a frame exposed at `stamp_ns` (`frame`: its bytes as they came, where it has any; `external`:
@@ -109,7 +113,13 @@ impl Guard {
         let place = Place { position, sigma_m: largest_sigma_m(&fix.covariance_enu_m2), report: self.reports.back().copied() };
         let searched_m = answer.searched.then_some(answer.prior.map_or(0.0, |prior| prior.radius_m));
         match self.weigh(stamp_ns, &place, report, searched_m) {
-            Ok(()) => {
+            Ok(confirmed) => {
+                let settled_m = self.settings.confirm_distance_m;
+                let since = self.doubtful.filter(|since| since.distance_m(position) < settled_m);
+                self.doubtful = if confirmed { since } else { Some(position) };
+                if self.doubtful.is_some() {
+                    (fix.calibrated, fix.p_over_25m) = (false, None);
+                }
                 // What the track went past confirms nothing any more.
                 self.held.clear();
                 self.published.push(stamp_ns, place);
@@ -121,17 +131,21 @@ impl Guard {
         }
     }
 
-    /// Published, or the words why not.
-    fn weigh(&self, stamp_ns: i64, place: &Place, new: Option<Report>, searched_m: Option<f64>) -> Result<(), String> {
+    /// Published, and whether more than time speaks for it; or the words why not.
+    fn weigh(&self, stamp_ns: i64, place: &Place, new: Option<Report>, searched_m: Option<f64>) -> Result<bool, String> {
         let jump = self.unexplained(stamp_ns, place, new);
         if jump.is_none() && searched_m.is_none() {
-            return Ok(());
+            return Ok(true);
         }
         // An older fix says nothing for a jump that the nearest one speaks against.
         let published = self.published.nearest(stamp_ns).filter(|_| jump.is_none());
-        let (agreed, needed) = (self.agreeing(stamp_ns, place, published, searched_m), self.settings.confirmations as usize);
+        let agreeing = |after_s: f64| self.agreeing(stamp_ns, place, published, searched_m, after_s);
+        let (agreed, needed) = (agreeing(f64::INFINITY), self.settings.confirmations as usize);
         if agreed >= needed {
-            return Ok(());
+            return Ok(true);
+        }
+        if searched_m.is_none() && agreeing(self.settings.confirm_after_s) >= needed {
+            return Ok(false);
         }
         let what = jump.unwrap_or_else(|| "position found by a search".to_owned());
         Err(format!("{what}; expected {needed} earlier answers of other ground that agree, found {agreed}"))
@@ -153,11 +167,19 @@ impl Guard {
         Some(format!("distance from the fix {age_s:.2} s before: expected at most {reach_m:.1} m, found {distance_m:.1} m"))
     }
 
-    /// How many earlier answers, held back or `published`, agree, each of other ground than this one and than the others.
-    fn agreeing(&self, stamp_ns: i64, place: &Place, published: Option<(i64, &Place)>, searched_m: Option<f64>) -> usize {
+    /// How many earlier answers, held back or `published`, agree, each of other ground than this one and than the others, or
+    /// `after_s` from them.
+    fn agreeing(
+        &self,
+        stamp_ns: i64,
+        place: &Place,
+        published: Option<(i64, &Place)>,
+        searched_m: Option<f64>,
+        after_s: f64,
+    ) -> usize {
         let settings = &self.settings;
         let other_ground = |(a_ns, a): (i64, &Place), (b_ns, b): (i64, &Place)| {
-            age_s(a_ns, b_ns).abs() >= settings.confirm_after_s
+            age_s(a_ns, b_ns).abs() >= after_s
                 || a.position.distance_m(b.position) >= settings.confirm_distance_m
         };
         let mut counted: Vec<(i64, &Place)> = Vec::new();

@@ -85,17 +85,39 @@ fn a_jump_is_held_back_until_other_ground_agrees() {
     assert!(track(&mut guard, T0 + 4 * S, 80.0));
     assert!(!track(&mut guard, T0 + 5 * S, 300.0));
     assert!(!track(&mut guard, T0 + 5 * S + S / 2, 305.0), "5 m and half a second on is the same ground");
-    assert!(track(&mut guard, T0 + 6 * S, 345.0), "45 m on is not");
+    assert_eq!(calibrated(&mut guard, T0 + 6 * S, 345.0), Some(true), "45 m on is not");
     assert!(track(&mut guard, T0 + 7 * S, 360.0));
 }
 
+/// Whether a fix at this place, with an own prior, is published as calibrated; None: held back.
+fn calibrated(guard: &mut Guard, stamp_ns: i64, east_m: f64) -> Option<bool> {
+    let at = place(east_m, 0.0);
+    let fix = judge(guard, stamp_ns, answer(at, own(at))).ok()?;
+    assert_eq!(fix.p_over_25m.is_some(), fix.calibrated);
+    Some(fix.calibrated)
+}
+
 #[test]
-fn a_place_that_stands_still_is_confirmed_later() {
+fn a_place_that_stands_still_is_confirmed_later_and_not_calibrated_before_it_moves() {
     let mut guard = guard();
-    assert!(track(&mut guard, T0, 0.0));
-    assert!(!track(&mut guard, T0 + S, 400.0));
-    assert!(!track(&mut guard, T0 + 2 * S, 400.0));
-    assert!(track(&mut guard, T0 + 3 * S, 401.0));
+    assert_eq!(calibrated(&mut guard, T0, 0.0), Some(true));
+    assert_eq!(calibrated(&mut guard, T0 + S, 400.0), None);
+    assert_eq!(calibrated(&mut guard, T0 + 2 * S, 400.0), None);
+    assert_eq!(calibrated(&mut guard, T0 + 3 * S, 401.0), Some(false));
+    assert_eq!(calibrated(&mut guard, T0 + 4 * S, 420.0), Some(false));
+    assert_eq!(calibrated(&mut guard, T0 + 6 * S, 440.9), Some(false), "39.9 m on");
+    assert_eq!(calibrated(&mut guard, T0 + 7 * S, 441.1), Some(true));
+    assert_eq!(calibrated(&mut guard, T0 + 8 * S, 402.0), Some(true), "once settled it stays so");
+}
+
+#[test]
+fn a_searched_place_of_a_vehicle_that_hovers_stays_held() {
+    let mut guard = guard();
+    for i in 0..20 {
+        assert!(judge(&mut guard, T0 + i * S, searched(place(1500.0 + (i % 2) as f64, 0.0), 3000.0)).is_err());
+    }
+    let moved = judge(&mut guard, T0 + 21 * S, searched(place(1542.0, 0.0), 3000.0));
+    assert!(moved.is_ok());
 }
 
 #[test]
