@@ -115,8 +115,8 @@ pub struct TrackSettings {
     pub confirm_within_s: f64,
     /// Largest ratio of what counts as agreement (a radius) to the radius of a search.
     pub max_agreement_share: f64,
-    /// Steps between external priors, all such as the vehicle can fly, after which their source is taken as continuous: then
-    /// it explains no jump of a fix.
+    /// Last steps between external priors: where all of them, or as many as there are, are such as the vehicle can fly, their
+    /// source is continuous and explains no jump of a fix.
     pub steady_reports: u32,
     /// The same picture so many times, among the last 16, is `held_back`,
     pub frozen_frames: u32,

@@ -8,7 +8,7 @@
 //!    it: a chain of own fixes does not outlive what others know. It confirms nothing.
 //! 3. A fix further from the published one nearest in time than motion allows is `held_back`; but not where a new external
 //!    prior came with it from a source that jumps itself (independent places, a restarted estimator). A source is taken as
-//!    continuous where its last `steady_reports` steps were such as the vehicle can fly.
+//!    continuous where it made a step, and its last `steady_reports` ones were such as the vehicle can fly.
 //! 4. A fix that was searched for beyond the bundle's D_C is always held back, 3. or not.
 //! 5. What 3. and 4. hold back is published where `confirmations` earlier answers of other ground agree with it: of other
 //!    ground, so that one picture does not confirm itself; for a searched one only where agreement by chance is rare. A jump
@@ -251,14 +251,14 @@ impl Guard {
         age_s(last.stamp_ns, report.stamp_ns) > self.settings.max_prior_age_s
     }
 
-    /// Whether the external priors moved as a vehicle does, over the last `steady_reports` steps.
+    /// Whether the external priors moved as a vehicle does, over the last `steady_reports` steps or as many as there are.
     fn source_is_continuous(&self) -> bool {
-        let steps = self.reports.iter().zip(self.reports.iter().skip(1));
-        let steps = steps.filter(|(a, b)| {
+        let mut steps = self.reports.iter().zip(self.reports.iter().skip(1));
+        let flyable = |(a, b): (&Report, &Report)| {
             let reach_m = self.settings.max_speed_mps * age_s(b.stamp_ns, a.stamp_ns).abs() + self.settings.jump_slack_m;
             a.position.distance_m(b.position) <= reach_m
-        });
-        steps.count() >= self.settings.steady_reports as usize
+        };
+        self.reports.len() > 1 && steps.all(flyable)
     }
 }
 

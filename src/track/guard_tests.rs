@@ -179,6 +179,18 @@ fn a_continuous_source_explains_no_jump_and_one_that_restarts_does() {
 }
 
 #[test]
+fn one_step_that_can_be_flown_makes_a_source_continuous() {
+    let mut guard = guard();
+    for i in 0..2 {
+        let at = place(20.0 * f64::from(i), 0.0);
+        let outcome = judge(&mut guard, T0 + i64::from(i) * S, answer(at, external(at, 512.0, 0.0)));
+        assert!(outcome.is_ok());
+    }
+    let jump = judge(&mut guard, T0 + 2 * S, answer(place(40.0, 400.0), external(place(40.0, 0.0), 512.0, 0.0)));
+    assert_eq!(jump.unwrap_err().reason, Reason::HeldBack);
+}
+
+#[test]
 fn a_report_that_an_unanswered_frame_used_is_still_new() {
     let mut guard = guard();
     assert!(judge(&mut guard, T0, answer(place(0.0, 0.0), external(place(0.0, 0.0), 300.0, 0.0))).is_ok());
@@ -405,17 +417,20 @@ proptest! {
         }
     }
 
-    /// Independent places, each with its own external prior, are all published.
+    /// Independent places, each with its own external prior, are all published: their priors are no flight.
     #[test]
     fn independent_places_are_published(
-        places in prop::collection::vec((-4000.0..4000.0, -4000.0..4000.0, 0.0..512.0, 0.0..360.0), 1..60),
+        steps in prop::collection::vec((300.0..6000.0, 0.0..360.0, 0.0..120.0, 0.0..360.0), 1..60),
     ) {
-        let mut guard = guard();
-        for (i, (east_m, north_m, off_m, to_deg)) in places.into_iter().enumerate() {
-            let at = place(east_m, north_m);
+        let (mut guard, mut at) = (guard(), place(0.0, 0.0));
+        let towards = |m: f64, to_deg: f64| {
             let (sin, cos) = f64::to_radians(to_deg).sin_cos();
-            let prior = external(at.offset(Enu { east_m: off_m * sin, north_m: off_m * cos }), 512.0, 0.0);
-            prop_assert!(judge(&mut guard, T0 + i as i64 * 10 * S, answer(at, prior)).is_ok());
+            Enu { east_m: m * sin, north_m: m * cos }
+        };
+        for (i, (step_m, to_deg, off_m, off_deg)) in steps.into_iter().enumerate() {
+            at = at.offset(towards(step_m, to_deg));
+            let prior = external(at.offset(towards(off_m, off_deg)), 512.0, 0.0);
+            prop_assert!(judge(&mut guard, T0 + i as i64 * S, answer(at, prior)).is_ok());
         }
     }
 
