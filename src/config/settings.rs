@@ -171,7 +171,7 @@ pub struct GateSettings {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BudgetSettings {
-    /// Attitude error per axis, degrees; times height above ground.
+    /// Attitude error per axis, degrees; times height above ground, over the squared cosine of the tilt.
     pub sigma_tilt_deg: f64,
     /// Attitude error where pitch and roll are unknown and nadir is assumed, degrees.
     pub sigma_tilt_unknown_deg: f64,

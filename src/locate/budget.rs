@@ -22,9 +22,10 @@ pub struct StatedError {
     pub radius999_m: f64,
 }
 
-/// covariance = match^2 + (agl x tilt)^2 + map^2 + (stamp x speed)^2 + floor^2 per axis. `match_sigma_m` is the calibration's
+/// covariance = match^2 + (agl x sec^2(t) x tilt)^2 + map^2 + (stamp x speed)^2 + floor^2 per axis. `match_sigma_m` is the calibration's
 /// for this match, else the last stage's, from the bundle; `tail999` is the radius of 0.999 in sigmas where the calibration
-/// found a wider one than a Gaussian's.
+/// found a wider one than a Gaussian's. t is the angle between the optical axis and the vertical: where the axis meets the
+/// ground, at agl x tan(t), moves by agl x sec^2(t) per radian.
 /// Where pitch or roll are unknown, nadir was assumed and the tilt is `sigma_tilt_unknown_deg`; where the height is
 /// unknown, `assumed_agl_m` stands in. Each term goes into the evidence.
 pub fn stated_error(
@@ -36,7 +37,7 @@ pub fn stated_error(
     evidence: &mut Evidence,
 ) -> StatedError {
     let tilt_deg = if pose.tilt_known() { settings.sigma_tilt_deg } else { settings.sigma_tilt_unknown_deg };
-    let lever_m = agl_m.unwrap_or(settings.assumed_agl_m);
+    let lever_m = agl_m.unwrap_or(settings.assumed_agl_m) / cos_tilt(pose).powi(2);
     let tilt_m = lever_m * tilt_deg.to_radians();
     evidence.insert(TILT_LEVER.into(), lever_m);
     let mut variance_m2 = 0.0;
@@ -55,6 +56,12 @@ pub fn stated_error(
     let sigma_m = widest_m2.sqrt();
     let radius999_m = CHI2_0999.sqrt().max(tail999) * sigma_m;
     StatedError { covariance_enu_m2, radius95_m: CHI2_095.sqrt() * sigma_m, radius999_m }
+}
+
+/// Of the angle between the optical axis and the vertical; beyond 60 degrees, where no frame is rectified, as there.
+fn cos_tilt(pose: &Pose) -> f64 {
+    let cos = |deg: Option<f64>| deg.unwrap_or(0.0).to_radians().cos();
+    (cos(pose.pitch_deg) * cos(pose.roll_deg)).max(0.5)
 }
 
 /// For a fix whose camera's pitch and roll were not measured but taken from its mount on a level vehicle: the tilt's term
@@ -100,7 +107,7 @@ mod tests {
         let pose = Pose { pitch_deg: Some(1.0), roll_deg: Some(0.0), ..Pose::default() };
         let mut evidence = Evidence::new();
         let error = stated_error(&SETTINGS, 3.0, 0.0, &pose, Some(100.0), &mut evidence);
-        let tilt = 100.0 * 0.5f64.to_radians();
+        let tilt = 100.0 / 1f64.to_radians().cos().powi(2) * 0.5f64.to_radians();
         let variance = 9.0 + tilt * tilt + 1.0 + 0.16 + 0.25;
         assert!((error.covariance_enu_m2[0][0] - variance).abs() < 1e-12 && error.covariance_enu_m2[0][1] == 0.0);
         assert!((error.radius95_m - (5.991f64 * variance).sqrt()).abs() < 1e-3);
@@ -111,6 +118,24 @@ mod tests {
         let wide = stated_error(&SETTINGS, 3.0, 5.0, &pose, Some(100.0), &mut evidence);
         assert_eq!(wide.radius95_m, error.radius95_m);
         assert!((wide.radius999_m - 5.0 * variance.sqrt()).abs() < 1e-9);
+    }
+
+    #[test]
+    fn the_lever_of_a_tilted_camera_is_longer() {
+        let tilt_m = |pitch_deg: f64, roll_deg: f64| {
+            let pose = Pose { pitch_deg: Some(pitch_deg), roll_deg: Some(roll_deg), ..Pose::default() };
+            let mut evidence = Evidence::new();
+            stated_error(&SETTINGS, 3.0, 0.0, &pose, Some(400.0), &mut evidence);
+            evidence["sigma_tilt_m"]
+        };
+        let nadir_m = 400.0 * SETTINGS.sigma_tilt_deg.to_radians();
+        assert!((tilt_m(0.0, 0.0) - nadir_m).abs() < 1e-12);
+        assert!((tilt_m(45.0, 0.0) - 2.0 * nadir_m).abs() < 1e-9 && (tilt_m(0.0, -45.0) - 2.0 * nadir_m).abs() < 1e-9);
+        // As the axis really moves on the ground.
+        let ground_m = |deg: f64| 400.0 * deg.to_radians().tan();
+        let moved_m = (ground_m(30.0 + 0.05) - ground_m(30.0 - 0.05)) * SETTINGS.sigma_tilt_deg / 0.1;
+        assert!((tilt_m(30.0, 0.0) - moved_m).abs() < 1e-3, "{} {moved_m}", tilt_m(30.0, 0.0));
+        assert!(tilt_m(90.0, 0.0).is_finite());
     }
 
     #[test]
