@@ -52,8 +52,7 @@ pub fn stated_error(
         variance_m2 += sigma_m * sigma_m;
     }
     let covariance_enu_m2 = [[variance_m2, 0.0], [0.0, variance_m2]];
-    let widest_m2 = largest_eigenvalue(&covariance_enu_m2);
-    let sigma_m = widest_m2.sqrt();
+    let sigma_m = largest_sigma_m(&covariance_enu_m2);
     let radius999_m = CHI2_0999.sqrt().max(tail999) * sigma_m;
     StatedError { covariance_enu_m2, radius95_m: CHI2_095.sqrt() * sigma_m, radius999_m }
 }
@@ -72,7 +71,7 @@ pub fn tilt_was_assumed(settings: &BudgetSettings, answer: &mut Answer) {
     let unknown_m = lever_m * settings.sigma_tilt_unknown_deg.to_radians();
     let more_m2 = (unknown_m * unknown_m - *sigma_m * *sigma_m).max(0.0);
     *sigma_m = sigma_m.max(unknown_m);
-    let before_m2 = largest_eigenvalue(&fix.covariance_enu_m2);
+    let before_m2 = largest_sigma_m(&fix.covariance_enu_m2).powi(2);
     let growth = (1.0 + more_m2 / before_m2).sqrt();
     let [[ee, _], [_, nn]] = &mut fix.covariance_enu_m2;
     *ee += more_m2;
@@ -81,10 +80,12 @@ pub fn tilt_was_assumed(settings: &BudgetSettings, answer: &mut Answer) {
     fix.radius999_m *= growth;
 }
 
-/// Of a symmetric matrix. With unequal axes the circle of this sigma holds more than its probability, never less.
-fn largest_eigenvalue(m: &[[f64; 2]; 2]) -> f64 {
-    let (mean, half) = ((m[0][0] + m[1][1]) / 2.0, (m[0][0] - m[1][1]) / 2.0);
-    mean + half.hypot(m[0][1])
+/// Square root of the larger eigenvalue of a covariance, metres: no axis is worse. With unequal axes the circle of this sigma
+/// holds more than its probability, never less.
+pub fn largest_sigma_m(covariance_m2: &[[f64; 2]; 2]) -> f64 {
+    let [[ee, en], [_, nn]] = *covariance_m2;
+    let mean = 0.5 * (ee + nn);
+    (mean + (0.5 * (ee - nn)).hypot(en)).sqrt()
 }
 
 #[cfg(test)]
@@ -181,6 +182,6 @@ mod tests {
 
     #[test]
     fn unequal_axes_are_bounded_by_the_longer() {
-        assert!((largest_eigenvalue(&[[5.0, 4.0], [4.0, 5.0]]) - 9.0).abs() < 1e-12);
+        assert!((largest_sigma_m(&[[5.0, 4.0], [4.0, 5.0]]) - 3.0).abs() < 1e-12);
     }
 }

@@ -19,10 +19,10 @@
 //! clock: time is what stamps say, in whatever order they come.
 
 use super::recent::Recent;
-use super::tracker::{age_s, largest_sigma_m};
+use super::tracker::age_s;
 use crate::config::TrackSettings;
 use crate::geo::LatLon;
-use crate::locate::{Answer, Fix, NoFix, Prior, PriorSource, Reason};
+use crate::locate::{Answer, Fix, NoFix, Prior, PriorSource, Reason, largest_sigma_m};
 use sha2::{Digest, Sha256};
 use std::collections::VecDeque;
 

@@ -18,7 +18,7 @@
 use super::recent::Recent;
 use crate::config::TrackSettings;
 use crate::geo::LatLon;
-use crate::locate::{Answer, NoFix, Prior, PriorSource, Reason};
+use crate::locate::{Answer, NoFix, Prior, PriorSource, Reason, largest_sigma_m};
 
 /// External reports, own fixes and echoes kept of each: enough for frames that come out of order.
 const KEPT: usize = 64;
@@ -215,13 +215,6 @@ impl Tracker {
 /// Seconds from `from_ns` to `to_ns`.
 pub(super) fn age_s(to_ns: i64, from_ns: i64) -> f64 {
     (i128::from(to_ns) - i128::from(from_ns)) as f64 / 1e9
-}
-
-/// Square root of the larger eigenvalue of a covariance, metres: no axis is worse.
-pub(super) fn largest_sigma_m(covariance_m2: &[[f64; 2]; 2]) -> f64 {
-    let [[ee, en], [_, nn]] = *covariance_m2;
-    let mean = 0.5 * (ee + nn);
-    (mean + (0.5 * (ee - nn)).hypot(en)).sqrt()
 }
 
 #[cfg(test)]
