@@ -157,7 +157,8 @@ impl Locate for Tilted {
 #[test]
 fn a_tilted_mount_without_an_attitude_counts_and_its_tilt_is_not_known() {
     let folder = tempfile::tempdir().expect("a folder");
-    let mut flight = flight(folder.path(), "good.png,1000000000,1,0,25.2,55.3,,500,,\ngood2.png,2000000000,1,0,25.2,55.3,,500,,\n");
+    let mut flight =
+        flight(folder.path(), "good.png,1000000000,1,0,25.2,55.3,,500,,\ngood2.png,2000000000,1,0,25.2,55.3,,500,,\n");
     flight.camera.mount_pitch_deg = 10.0;
     flight.rows[1].pose = crate::thermal::Pose { pitch_deg: Some(2.0), roll_deg: Some(0.0), ..flight.rows[1].pose };
     let settings = Settings::defaults().expect("defaults").track;

@@ -165,7 +165,16 @@ mod tests {
                 homography: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
             };
             let latency_ms = Default::default();
-            Answer { outcome: Ok(fix), withheld: None, prior: None, bundle: None, searched: false, window: None, evidence, latency_ms }
+            Answer {
+                outcome: Ok(fix),
+                withheld: None,
+                prior: None,
+                bundle: None,
+                searched: false,
+                window: None,
+                evidence,
+                latency_ms,
+            }
         };
         let level = Pose { pitch_deg: Some(0.0), roll_deg: Some(0.0), ..Pose::default() };
         let (mut assumed, unknown) = (stated(&level), stated(&Pose::default()));

@@ -179,8 +179,7 @@ impl Guard {
     ) -> usize {
         let settings = &self.settings;
         let other_ground = |(a_ns, a): (i64, &Place), (b_ns, b): (i64, &Place)| {
-            age_s(a_ns, b_ns).abs() >= after_s
-                || a.position.distance_m(b.position) >= settings.confirm_distance_m
+            age_s(a_ns, b_ns).abs() >= after_s || a.position.distance_m(b.position) >= settings.confirm_distance_m
         };
         let mut counted: Vec<(i64, &Place)> = Vec::new();
         for (at_ns, earlier) in self.held.newest_first().chain(published) {
@@ -268,7 +267,9 @@ fn contradicts(external: &Prior, position: LatLon) -> Option<String> {
     let within = distance_m <= radius_m * (1.0 + ROUNDING);
     let age_s = external.age_s.unwrap_or(0.0);
     (!within).then(|| {
-        format!("distance from the external prior of {age_s:.2} s before: expected at most {radius_m:.1} m, found {distance_m:.1} m")
+        format!(
+            "distance from the external prior of {age_s:.2} s before: expected at most {radius_m:.1} m, found {distance_m:.1} m"
+        )
     })
 }
 

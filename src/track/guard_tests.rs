@@ -328,7 +328,11 @@ fn a_fix_outside_the_external_disc_is_held_back_and_confirms_nothing() {
     for i in 1..4 {
         let refused = judge(&mut guard, i, bound(101.0, 100.0)).unwrap_err();
         assert_eq!(refused.reason, Reason::HeldBack);
-        assert!(refused.detail.contains("external prior of 0.25 s before") && refused.detail.contains("found 101"), "{}", refused.detail);
+        assert!(
+            refused.detail.contains("external prior of 0.25 s before") && refused.detail.contains("found 101"),
+            "{}",
+            refused.detail
+        );
     }
     assert!(guard.held.newest_first().next().is_none());
     assert!(judge(&mut guard, 4, bound(300.0, 400.0)).is_ok(), "an old prior has a wide disc");

@@ -151,8 +151,7 @@ impl Tracker {
         let given_up = self.given_up.nearest(stamp_ns).filter(|(at, _)| recent(*at));
         let mut known: Vec<(i64, &Known)> = self.fresh_external(stamp_ns).into_iter().chain(own).collect();
         known.sort_by_key(|(at, known)| (at.abs_diff(stamp_ns), u64::MAX - known.arrival));
-        let priors: Vec<Prior> =
-            known.into_iter().chain(given_up).map(|(at, known)| self.grown(stamp_ns, at, known)).collect();
+        let priors: Vec<Prior> = known.into_iter().chain(given_up).map(|(at, known)| self.grown(stamp_ns, at, known)).collect();
         let narrow = priors.iter().find(|prior| prior.radius_m <= self.search_radius_m);
         let prior = narrow.or_else(|| priors.iter().min_by(|a, b| a.radius_m.total_cmp(&b.radius_m)));
         prior.copied().ok_or_else(|| self.no_prior_at(stamp_ns))
