@@ -259,16 +259,18 @@ fn the_echo_of_our_own_fix_is_known_and_its_depth_is_said() {
     assert_eq!(prior(3), ("external".into(), 0.into()));
 }
 
-/// A picture that stands still with bytes that change: the answer is one place for ever, by way of own fixes.
+/// A picture that stands still with bytes that change: one place for ever by way of own fixes, each nearer in time than the
+/// external prior, which comes once a second and a second late.
 #[test]
 fn an_external_prior_ends_a_chain_of_own_fixes() {
     let bench = bench(LONG);
     let home = LatLon { lat_deg: 25.0, lon_deg: 55.0 };
-    let hertz4 = (0..40).map(|i: i64| {
+    let hertz4 = (0..48).map(|i: i64| {
         if i % 4 == 0 {
             // 20 m/s to the north, known to 100 m.
-            let position = home.offset(crate::geo::Enu { east_m: 0.0, north_m: 5.0 * i as f64 });
-            let known = PriorReport { position, spread: Spread::RadiusM(100.0), ..prior(S + i * S / 4) };
+            let then = (i - 4).max(0);
+            let position = home.offset(crate::geo::Enu { east_m: 0.0, north_m: 5.0 * then as f64 });
+            let known = PriorReport { position, spread: Spread::RadiusM(100.0), ..prior(S + then * S / 4) };
             assert!(lock(&bench.inbox.tracker).report(known));
         }
         let frame = FrameBytes { bytes: vec![i as u8], encoding: Encoding::Png, size_px: (640, 512) };
@@ -283,13 +285,13 @@ fn an_external_prior_ends_a_chain_of_own_fixes() {
         }
         answer
     });
-    // 25 x 0.5 m of growth on top of the bound, at most.
-    for message in &messages[24..] {
-        assert!(message.reason.is_some(), "{message:?}");
-    }
-    let held = messages.iter().find(|m| m.reason == Some(Reason::HeldBack)).unwrap();
+    assert!(messages[..32].iter().all(|message| message.status == Status::Fix));
+    let held = &messages[36];
+    assert_eq!((held.reason, held.prior.unwrap().source), (Some(Reason::HeldBack), PriorSource::OwnFix));
     assert!(held.detail.as_deref().unwrap().contains("external prior"), "{held:?}");
-    assert_eq!(messages[39].prior.unwrap().source, PriorSource::External, "the chain is given up");
+    // 160 m off by then, of 100 m + 25 x 1.75 m at most; five in a row, and the chain is given up.
+    assert!(messages[36..].iter().all(|message| message.status == Status::NoFix));
+    assert_eq!(messages[41].prior.unwrap().source, PriorSource::External);
 }
 
 #[test]
