@@ -178,10 +178,15 @@ impl Tracker {
     /// An answer was given for a frame exposed at `stamp_ns`, with message number `seq`.
     pub fn record(&mut self, stamp_ns: i64, seq: u64, answer: &Answer) {
         let Ok(fix) = &answer.outcome else {
+            // Where nothing of ours is known there is nothing to lose.
+            if self.own.newest_first().next().is_none() {
+                return;
+            }
             self.no_fix_in_row = self.no_fix_in_row.saturating_add(1);
             if self.no_fix_in_row >= self.settings.fall_back_after_no_fix {
                 self.own.clear();
                 self.believed_from_seq = seq.saturating_add(1);
+                self.no_fix_in_row = 0;
             }
             return;
         };

@@ -286,10 +286,15 @@ fn an_echo_of_a_fix_that_is_forgotten_is_refused() {
 fn an_echo_of_an_unknown_fix_is_not_believed_after_a_loss() {
     let mut tracker = tracker();
     let echo = PriorReport { fix_seq: Some(9000), ..sigma(T0, 90.0, 60.0) };
-    assert!(tracker.report(echo));
     for seq in 1..=5 {
         tracker.record(T0, seq, &no_fix());
     }
+    assert!(tracker.report(echo), "frames before the first prior lose nothing");
+    for seq in 6..=9 {
+        tracker.record(T0, seq, &no_fix());
+    }
+    assert!(tracker.report(echo));
+    tracker.record(T0, 10, &no_fix());
     assert!(!tracker.report(echo));
     assert_eq!(tracker.prior_at(T0).unwrap_err().reason, Reason::NoPrior);
 }
