@@ -116,6 +116,8 @@ pub struct TrackMessage {
     /// Squared innovation of the fix in units of its covariance, 2 degrees of freedom; absent where the track begins.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub innovation_nees: Option<f64>,
+    /// Whether the stated errors of all fixes from the lagged one on were calibrated: then none was found by a search.
+    pub calibrated: bool,
     /// What is known now of an earlier fix's place.
     pub lagged: LaggedState,
 }

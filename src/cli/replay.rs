@@ -1,7 +1,7 @@
 //! `nightfix replay`: a recorded flight through the localizer; `fixes.jsonl`, `metrics.json`, thresholds.
 
 use super::{Common, Outcome, UsageError};
-use crate::config::{MAX_SEARCH_RADIUS_M, Settings};
+use crate::config::{BudgetSettings, MAX_SEARCH_RADIUS_M, Settings};
 use crate::daemon::equip;
 use crate::flight::{Flight, ReplayLine, ReplayReport, Thresholds, replay};
 use crate::locate::Ladder;
@@ -69,7 +69,7 @@ pub fn run(common: &Common, args: Args) -> Result<Outcome, UsageError> {
     let (mut localizer, tracker) = prepare(common, &args, &settings, &flight)?;
     let guard = Guard::new(settings.track.clone(), settings.gates.enabled);
     let filter = settings.track.publish_track.then(|| TrackFilter::new(settings.track.clone()));
-    let report = fly(&flight, &mut localizer, tracker, guard, filter, args.out.as_deref())?;
+    let report = fly(&flight, &mut localizer, &settings.budget, tracker, guard, filter, args.out.as_deref())?;
     let text = serde_json::to_string_pretty(&report.metrics).map_err(|e| UsageError::from_error(&e))?;
     if let Some(folder) = &args.out {
         let path = folder.join("metrics.json");
@@ -122,6 +122,7 @@ fn prepare(common: &Common, args: &Args, settings: &Settings, flight: &Flight) -
 fn fly(
     flight: &Flight,
     localizer: &mut Ladder,
+    budget: &BudgetSettings,
     tracker: Tracker,
     guard: Guard,
     mut filter: Option<TrackFilter>,
@@ -150,7 +151,7 @@ fn fly(
         serde_json::to_writer(&mut *file, line)?;
         file.write_all(b"\n")
     };
-    let report = replay(flight, localizer, tracker, guard, &mut write);
+    let report = replay(flight, localizer, budget, tracker, guard, &mut write);
     if let Some(bar) = &bar {
         bar.finish_and_clear();
     }

@@ -60,8 +60,8 @@ impl Settings {
         positive("track.max_prior_age_s", track.max_prior_age_s, 86_400.0)?;
         at_most("track.jump_slack_m", track.jump_slack_m, 100_000.0)?;
         whole("track.confirmations", track.confirmations.into(), 1, 8)?;
-        at_most("track.confirm_distance_m", track.confirm_distance_m, 100_000.0)?;
-        at_most("track.confirm_after_s", track.confirm_after_s, 3600.0)?;
+        positive("track.confirm_distance_m", track.confirm_distance_m, 100_000.0)?;
+        positive("track.confirm_after_s", track.confirm_after_s, 3600.0)?;
         positive("track.confirm_within_s", track.confirm_within_s, 3600.0)?;
         between("track.max_agreement_share", track.max_agreement_share, 0.0, 1.0)?;
         whole("track.steady_reports", track.steady_reports.into(), 1, 100)?;
@@ -177,6 +177,9 @@ mod tests {
         }
         refuses("onnxruntime", "provider = \"CPU\"");
         refuses("track", "own_fix_sigma_m = 10.0");
+        // 0 would be any answer, the same one among them.
+        refuses("track", "confirm_distance_m = 0.0");
+        refuses("track", "confirm_after_s = 0.0");
         refuses("zenoh", "mode = \"router\"");
         refuses("zenoh", "connect.endpoints = [\"127.0.0.1:7447\"]");
         refuses("zenoh", "listen.endpoints = [\"tcp/127.0.0.1:7447\", \"\"]");

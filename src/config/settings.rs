@@ -109,16 +109,16 @@ pub struct TrackSettings {
     pub confirmations: u32,
     /// Answers this far apart are of other ground, metres.
     pub confirm_distance_m: f64,
-    /// Answers this much apart in time are of other ground, seconds.
+    /// A jump (not what a search found) is also confirmed by answers this much apart in time, seconds: not calibrated.
     pub confirm_after_s: f64,
     /// Answers further apart in time do not confirm each other, seconds.
     pub confirm_within_s: f64,
     /// Largest ratio of what counts as agreement (a radius) to the radius of a search.
     pub max_agreement_share: f64,
-    /// Steps between external priors, all such as the vehicle can fly, after which their source is taken as continuous: then
-    /// it explains no jump of a fix.
+    /// Last steps between external priors: where all of them, or as many as there are, are such as the vehicle can fly, their
+    /// source is continuous and explains no jump of a fix.
     pub steady_reports: u32,
-    /// The same picture so many times in a row is `held_back`,
+    /// The same picture so many times, among the last 16, is `held_back`,
     pub frozen_frames: u32,
     /// where the first and the last are at least this far apart, seconds: some streams repeat a slow camera's pictures.
     pub frozen_after_s: f64,
@@ -171,7 +171,7 @@ pub struct GateSettings {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BudgetSettings {
-    /// Attitude error per axis, degrees; times height above ground.
+    /// Attitude error per axis, degrees; times height above ground, over the squared cosine of the tilt.
     pub sigma_tilt_deg: f64,
     /// Attitude error where pitch and roll are unknown and nadir is assumed, degrees.
     pub sigma_tilt_unknown_deg: f64,

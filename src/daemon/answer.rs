@@ -6,8 +6,9 @@ use super::newest::{Newest, Popped};
 use super::publish::Outbox;
 use super::throttle::lock;
 use crate::bus::FixMessage;
-use crate::locate::{Answer, EncodedFrame, NoFix, Query, Reason};
-use crate::thermal::{CameraModel, Encoding, FrameError, Pose};
+use crate::config::Settings;
+use crate::locate::{Answer, EncodedFrame, NoFix, Query, Reason, tilt_was_assumed};
+use crate::thermal::{Encoding, FrameError, Pose};
 use crate::track::{Guard, Tracker};
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
@@ -63,7 +64,7 @@ pub fn answer_frames(
     inbox: &Inbox,
     outbox: &Outbox,
     health: &Health,
-    camera: &CameraModel,
+    settings: &Settings,
     deadline: Duration,
     mut guard: Guard,
     mut locate: impl FnMut(&Query<'_>) -> Answer,
@@ -79,8 +80,10 @@ pub fn answer_frames(
             Popped::Closed => return,
         };
         health.begin(job.arrived);
-        let mut answer = answer(inbox, &job, camera, deadline, &mut locate);
-        guard.judge(job.stamp_ns, job.frame.as_ref().ok().map(|frame| frame.bytes.as_slice()), &mut answer);
+        let mut answer = answer(inbox, &job, settings, deadline, &mut locate);
+        let external = lock(&inbox.tracker).external_at(job.stamp_ns);
+        let bytes = job.frame.as_ref().ok().map(|frame| frame.bytes.as_slice());
+        guard.judge(job.stamp_ns, bytes, external.as_ref(), &mut answer);
         lock(&inbox.tracker).record(job.stamp_ns, seq, &answer);
         let reason = answer.outcome.as_ref().err().map(|no_fix| no_fix.reason);
         outbox.push(FixMessage::new(job.stamp_ns, seq, &answer, &identity.bundle, &identity.map), health);
@@ -93,7 +96,7 @@ pub fn answer_frames(
 fn answer(
     inbox: &Inbox,
     job: &Job,
-    camera: &CameraModel,
+    settings: &Settings,
     deadline: Duration,
     locate: &mut impl FnMut(&Query<'_>) -> Answer,
 ) -> Answer {
@@ -107,7 +110,7 @@ fn answer(
             encoding: frame.encoding,
             size_px: Some(frame.size_px),
         }),
-        pose: camera_pose(&job.stated, vehicle.as_ref(), camera),
+        pose: camera_pose(&job.stated, vehicle.as_ref(), &settings.camera),
         prior,
     };
     let mut answer = if waited > deadline {
@@ -126,6 +129,9 @@ fn answer(
     } else {
         locate(&query)
     };
+    if !(job.stated.tilt_known() || vehicle.is_some_and(|vehicle| vehicle.tilt_known())) {
+        tilt_was_assumed(&settings.budget, &mut answer);
+    }
     let took = job.arrived.elapsed();
     if answer.outcome.is_ok() && took > deadline {
         answer.outcome = Err(late(took, deadline));

@@ -73,11 +73,20 @@ impl Bench {
         deadline: Duration,
         locate: impl FnMut(&Query<'_>) -> Answer + Send,
     ) -> Vec<FixMessage> {
-        let camera = CameraModel::default();
+        self.answer_with(&Settings::defaults().unwrap(), jobs, deadline, locate)
+    }
+
+    fn answer_with(
+        &self,
+        settings: &Settings,
+        jobs: impl IntoIterator<Item = Job>,
+        deadline: Duration,
+        locate: impl FnMut(&Query<'_>) -> Answer + Send,
+    ) -> Vec<FixMessage> {
         let mut messages = Vec::new();
         std::thread::scope(|scope| {
-            let guard = Guard::new(Settings::defaults().unwrap().track, true);
-            scope.spawn(|| answer_frames(&self.inbox, &self.outbox, &self.health, &camera, deadline, guard, locate));
+            let guard = Guard::new(settings.track.clone(), true);
+            scope.spawn(|| answer_frames(&self.inbox, &self.outbox, &self.health, settings, deadline, guard, locate));
             for job in jobs {
                 let seq = self.outbox.last().message.seq;
                 assert!(self.inbox.frames.push(job).is_none());
@@ -177,6 +186,41 @@ fn the_pose_comes_from_the_frame_then_from_the_attitude() {
     assert_eq!(seen[1], Pose::default(), "too old is unknown");
 }
 
+#[test]
+fn a_tilted_mount_without_an_attitude_counts_and_its_tilt_is_not_known() {
+    let bench = bench(LONG);
+    lock(&bench.inbox.tracker).report(prior(S));
+    lock(&bench.inbox.attitudes).push(crate::bus::AttitudeMessage {
+        stamp_ns: 2 * S,
+        roll_deg: 1.0,
+        pitch_deg: 2.0,
+        yaw_deg: 30.0,
+        agl_m: None,
+    });
+    let picture = |i: i64, stated: Pose| {
+        let frame = FrameBytes { bytes: vec![i as u8], encoding: Encoding::Png, size_px: (640, 512) };
+        Job { frame: Ok(frame), stated, ..job(i * S) }
+    };
+    let half = Pose { pitch_deg: Some(10.0), ..Pose::default() };
+    let whole = Pose { roll_deg: Some(0.0), ..half };
+    let jobs = vec![picture(1, Pose::default()), picture(2, Pose::default()), picture(3, half), picture(4, whole)];
+    let mut settings = Settings::defaults().unwrap();
+    settings.camera.mount_pitch_deg = 10.0;
+    let pitches = Mutex::new(Vec::new());
+    let messages = bench.answer_with(&settings, jobs, LONG, |query| {
+        lock(&pitches).push(query.pose.pitch_deg.unwrap());
+        let mut answer = locate(query);
+        answer.evidence.insert("tilt_lever_m".to_owned(), 400.0);
+        answer.evidence.insert("sigma_tilt_m".to_owned(), 400.0 * 0.5_f64.to_radians());
+        answer
+    });
+    let pitches: Vec<i64> = pitches.into_inner().unwrap().iter().map(|p| p.round() as i64).collect();
+    assert_eq!(pitches, [10, 12, 10, 10]);
+    let tilts: Vec<i64> = messages.iter().map(|m| (m.evidence["sigma_tilt_m"] * 10.0).round() as i64).collect();
+    assert_eq!(tilts, [140, 35, 140, 35]);
+    assert!(messages[0].covariance_enu_m2.unwrap()[0][0] > messages[1].covariance_enu_m2.unwrap()[0][0]);
+}
+
 /// Through two real messages: what we publish, and what an estimator makes of it.
 #[test]
 fn the_echo_of_our_own_fix_is_known_and_its_depth_is_said() {
@@ -213,6 +257,41 @@ fn the_echo_of_our_own_fix_is_known_and_its_depth_is_said() {
     assert_eq!(prior(2), ("own_fix".into(), 4.into()));
     // Without `fix_seq` an echo cannot be told from a prior of its own right.
     assert_eq!(prior(3), ("external".into(), 0.into()));
+}
+
+/// A picture that stands still with bytes that change: one place for ever by way of own fixes, each nearer in time than the
+/// external prior, which comes once a second and a second late.
+#[test]
+fn an_external_prior_ends_a_chain_of_own_fixes() {
+    let bench = bench(LONG);
+    let home = LatLon { lat_deg: 25.0, lon_deg: 55.0 };
+    let hertz4 = (0..48).map(|i: i64| {
+        if i % 4 == 0 {
+            // 20 m/s to the north, known to 100 m.
+            let then = (i - 4).max(0);
+            let position = home.offset(crate::geo::Enu { east_m: 0.0, north_m: 5.0 * then as f64 });
+            let known = PriorReport { position, spread: Spread::RadiusM(100.0), ..prior(S + then * S / 4) };
+            assert!(lock(&bench.inbox.tracker).report(known));
+        }
+        let frame = FrameBytes { bytes: vec![i as u8], encoding: Encoding::Png, size_px: (640, 512) };
+        Job { frame: Ok(frame), ..job(S + i * S / 4) }
+    });
+    let messages = bench.answer(hertz4, LONG, |query| {
+        let mut answer = locate(query);
+        let reach_m = query.prior.as_ref().map_or(0.0, |prior| prior.position.distance_m(home) - prior.radius_m);
+        match &mut answer.outcome {
+            Ok(fix) if reach_m <= 0.0 => fix.position = home,
+            _ => answer.outcome = Err(NoFix::new(Reason::OutsidePrior, "")),
+        }
+        answer
+    });
+    assert!(messages[..32].iter().all(|message| message.status == Status::Fix));
+    let held = &messages[36];
+    assert_eq!((held.reason, held.prior.unwrap().source), (Some(Reason::HeldBack), PriorSource::OwnFix));
+    assert!(held.detail.as_deref().unwrap().contains("external prior"), "{held:?}");
+    // 160 m off by then, of 100 m + 25 x 1.75 m at most; five in a row, and the chain is given up.
+    assert!(messages[36..].iter().all(|message| message.status == Status::NoFix));
+    assert_eq!(messages[41].prior.unwrap().source, PriorSource::External);
 }
 
 #[test]

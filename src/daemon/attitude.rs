@@ -41,13 +41,13 @@ impl Attitudes {
 }
 
 /// The camera's pose at exposure: what the frame states (it speaks of the camera), else what the vehicle's attitude
-/// and the mount give, else the configured field of view, else unknown.
+/// and the mount give (of a vehicle whose attitude is unknown: level), else the configured field of view, else unknown.
 pub fn camera_pose(stated: &Pose, vehicle: Option<&Pose>, camera: &CameraModel) -> Pose {
-    let derived = vehicle.map(|vehicle| camera.camera_pose(vehicle)).unwrap_or_default();
+    let derived = camera.camera_pose(&vehicle.copied().unwrap_or_default());
     Pose {
         agl_m: stated.agl_m.or(derived.agl_m),
         gsd_m: stated.gsd_m,
-        hfov_deg: stated.hfov_deg.or(camera.hfov_deg),
+        hfov_deg: stated.hfov_deg.or(derived.hfov_deg),
         yaw_deg: stated.yaw_deg.or(derived.yaw_deg),
         pitch_deg: stated.pitch_deg.or(derived.pitch_deg),
         roll_deg: stated.roll_deg.or(derived.roll_deg),
@@ -145,6 +145,17 @@ mod tests {
     }
 
     #[test]
+    fn after_a_step_back_nothing_of_the_future_is_left() {
+        // 20 Hz, 5 s of it; then the clock is 2 s back, and the vehicle looks the other way.
+        let before: Vec<_> = (0..100).map(|i| message(50 * i, 90.0, 0.0, None)).collect();
+        let mut attitudes = attitudes(&before);
+        attitudes.push(message(2960, 270.0, 0.0, None));
+        attitudes.push(message(3010, 270.0, 0.0, None));
+        close(attitudes.at(T0 + 3000 * MS).unwrap().yaw_deg, 270.0);
+        close(attitudes.at(T0 + 3050 * MS).unwrap().yaw_deg, 270.0);
+    }
+
+    #[test]
     fn one_side_too_old_leaves_the_other() {
         let attitudes = attitudes(&[message(0, 10.0, 0.0, None), message(500, 50.0, 0.0, None)]);
         close(attitudes.at(T0 + 150 * MS).unwrap().yaw_deg, 10.0);
@@ -166,5 +177,18 @@ mod tests {
         assert_eq!(pose.gsd_m, None);
         let pose = camera_pose(&Pose { hfov_deg: Some(20.0), ..Pose::default() }, None, &camera);
         assert_eq!(pose, Pose { hfov_deg: Some(20.0), ..Pose::default() });
+    }
+
+    #[test]
+    fn a_tilted_mount_counts_without_an_attitude() {
+        let camera = CameraModel { mount_pitch_deg: 10.0, mount_roll_deg: -4.0, ..CameraModel::default() };
+        let pose = camera_pose(&Pose::default(), None, &camera);
+        close(pose.pitch_deg, 10.0);
+        close(pose.roll_deg, -4.0);
+        assert_eq!(pose.yaw_deg, None);
+        let stated = Pose { pitch_deg: Some(1.0), ..Pose::default() };
+        let pose = camera_pose(&stated, None, &camera);
+        close(pose.pitch_deg, 1.0);
+        close(pose.roll_deg, -4.0);
     }
 }

@@ -11,7 +11,8 @@
 //! What it promises:
 //! * Every frame that comes in is answered exactly once, or counted: `dropped` where a newer one displaced it, `bad`
 //!   where not even its stamp could be read. Newest is by arrival: a stamp that repeats or goes back is answered like
-//!   any other, so that a clock that steps costs nothing but the priors it makes stale.
+//!   any other. A clock that steps forward costs the priors that it makes stale; one that steps back by over a second costs the
+//!   priors, fixes and attitudes stamped later than the next one of their kind.
 //! * Publishing never holds up localisation; what a stuck peer does not take in time is counted.
 //! * The watchdog is pinged while every loop turns and no accepted frame is older than its deadline. Without frames
 //!   that holds, so an idle service lives, and says that it is idle.

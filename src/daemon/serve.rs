@@ -177,9 +177,9 @@ async fn serve(
     };
 
     let mut inference = {
-        let (inbox, outbox, health, camera) = (inbox.clone(), outbox.clone(), health.clone(), settings.camera);
+        let (inbox, outbox, health, settings) = (inbox.clone(), outbox.clone(), health.clone(), settings.clone());
         Worker::start("inference", move || {
-            answer_frames(&inbox, &outbox, &health, &camera, deadline, guard, |query| {
+            answer_frames(&inbox, &outbox, &health, &settings, deadline, guard, |query| {
                 let begun = Instant::now();
                 localizer.locate_within(query, &|| begun.elapsed() < search_budget).0
             });

@@ -5,7 +5,8 @@
 use super::format::{Flight, Row};
 use super::metrics::{Metrics, Tally};
 use crate::bus::{FixMessage, MapId};
-use crate::locate::{Answer, EncodedFrame, Ladder, NoFix, Prior, PriorSource, Query, Reason};
+use crate::config::BudgetSettings;
+use crate::locate::{Answer, EncodedFrame, Ladder, NoFix, Prior, PriorSource, Query, Reason, tilt_was_assumed};
 use crate::thermal::{FrameError, decode};
 use crate::track::{Guard, PriorReport, Spread, Tracker};
 use serde::Serialize;
@@ -53,6 +54,7 @@ impl Locate for Ladder {
 pub fn replay<E>(
     flight: &Flight,
     localizer: &mut impl Locate,
+    budget: &BudgetSettings,
     mut tracker: Tracker,
     mut guard: Guard,
     mut line: impl FnMut(&ReplayLine) -> Result<(), E>,
@@ -71,7 +73,11 @@ pub fn replay<E>(
             prior: prior(row, &mut tracker),
         };
         let mut answer = localizer.locate(&query);
-        guard.judge(row.stamp_ns, query.frame.as_ref().ok().map(|frame| frame.bytes), &mut answer);
+        if !row.pose.tilt_known() {
+            tilt_was_assumed(budget, &mut answer);
+        }
+        let bytes = query.frame.as_ref().ok().map(|frame| frame.bytes);
+        guard.judge(row.stamp_ns, bytes, tracker.external_at(row.stamp_ns).as_ref(), &mut answer);
         tracker.record(row.stamp_ns, seq, &answer);
         unreadable += usize::from(is_unreadable(&query.frame, &answer));
         let message = FixMessage::new(row.stamp_ns, seq, &answer, &bundle, &map);

@@ -62,11 +62,15 @@ fn flight(folder: &Path, rows: &str) -> Flight {
     Flight::open(folder).expect("a flight")
 }
 
+fn budget() -> BudgetSettings {
+    Settings::defaults().expect("defaults").budget
+}
+
 fn run(flight: &Flight) -> (Vec<serde_json::Value>, ReplayReport) {
     let settings = TrackSettings { frozen_frames: 3, ..Settings::defaults().expect("defaults").track };
     let (tracker, guard) = (Tracker::new(settings.clone()), Guard::new(settings, true));
     let mut lines = Vec::new();
-    let report = replay(flight, &mut Echo, tracker, guard, |line| {
+    let report = replay(flight, &mut Echo, &budget(), tracker, guard, |line| {
         lines.push(serde_json::to_value(line)?);
         Ok::<_, serde_json::Error>(())
     });
@@ -134,6 +138,41 @@ fn a_row_s_own_prior_first_then_the_last_fix() {
     assert_eq!(widthless["reason"], "no_prior");
 }
 
+/// As [`Echo`], with the tilt's term of an attitude that is known.
+struct Tilted;
+
+impl Locate for Tilted {
+    fn locate(&mut self, query: &Query<'_>) -> Answer {
+        let mut answer = Echo.locate(query);
+        answer.evidence.insert("tilt_lever_m".to_owned(), 400.0);
+        answer.evidence.insert("sigma_tilt_m".to_owned(), 400.0 * 0.5_f64.to_radians());
+        answer.evidence.insert("pitch_deg".to_owned(), query.pose.pitch_deg.unwrap_or(f64::NAN));
+        answer
+    }
+    fn identity(&self) -> (String, MapId) {
+        Echo.identity()
+    }
+}
+
+#[test]
+fn a_tilted_mount_without_an_attitude_counts_and_its_tilt_is_not_known() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut flight =
+        flight(folder.path(), "good.png,1000000000,1,0,25.2,55.3,,500,,\ngood2.png,2000000000,1,0,25.2,55.3,,500,,\n");
+    flight.camera.mount_pitch_deg = 10.0;
+    flight.rows[1].pose = crate::thermal::Pose { pitch_deg: Some(2.0), roll_deg: Some(0.0), ..flight.rows[1].pose };
+    let settings = Settings::defaults().expect("defaults").track;
+    let (tracker, guard) = (Tracker::new(settings.clone()), Guard::new(settings, true));
+    let mut seen = Vec::new();
+    let report = replay(&flight, &mut Tilted, &budget(), tracker, guard, |line| {
+        let tenths = |name: &str| (line.message.evidence[name] * 10.0).round() as i64;
+        seen.push((tenths("pitch_deg"), tenths("sigma_tilt_m")));
+        Ok::<_, ()>(())
+    });
+    assert!(report.is_ok());
+    assert_eq!(seen, [(100, 140), (120, 35)]);
+}
+
 #[test]
 fn two_runs_give_the_same_lines() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -148,7 +187,7 @@ fn an_error_of_the_writer_ends_the_replay() {
     let settings = TrackSettings { frozen_frames: 3, ..Settings::defaults().expect("defaults").track };
     let (tracker, guard) = (Tracker::new(settings.clone()), Guard::new(settings, true));
     let mut count = 0;
-    let result = replay(&flight, &mut Echo, tracker, guard, |_| {
+    let result = replay(&flight, &mut Echo, &budget(), tracker, guard, |_| {
         count += 1;
         Err("full")
     });
@@ -158,7 +197,7 @@ fn an_error_of_the_writer_ends_the_replay() {
 #[test]
 fn the_guard_stands_between_the_localizer_and_the_tracker() {
     let folder = tempfile::tempdir().expect("a folder");
-    // The same file three times in a row; then another, and the file again.
+    // The same file three times; then another, and the file again.
     let rows = "good.png,1000000000,1,0,25.2,55.3,,500,,\n\
                 good.png,2000000000,1,0,,,,,,\n\
                 good.png,3000000000,1,0,,,,,,\n\
@@ -167,15 +206,15 @@ fn the_guard_stands_between_the_localizer_and_the_tracker() {
     let flight = flight(folder.path(), rows);
     let (lines, report) = run(&flight);
     let statuses: Vec<_> = lines.iter().map(|line| line["status"].as_str().unwrap()).collect();
-    assert_eq!(statuses, ["fix", "fix", "no_fix", "fix", "fix"]);
+    assert_eq!(statuses, ["fix", "fix", "no_fix", "fix", "no_fix"]);
     assert_eq!(lines[2]["reason"], "held_back");
     assert!(lines[2]["detail"].as_str().unwrap().contains("frozen") && lines[2].get("lat_deg").is_none());
     // Frame 4 starts from the fix of frame 2: what was held back is no prior.
     assert_eq!((&lines[3]["prior"]["chain"], &lines[3]["prior"]["age_s"]), (&2.into(), &2.0.into()));
-    assert_eq!(report.metrics.no_fix[&Reason::HeldBack], 1);
+    assert_eq!(report.metrics.no_fix[&Reason::HeldBack], 2);
 
     let settings = TrackSettings { frozen_frames: 3, ..Settings::defaults().expect("defaults").track };
     let (tracker, guard) = (Tracker::new(settings.clone()), Guard::new(settings, false));
-    let report = replay(&flight, &mut Echo, tracker, guard, |_| Ok::<_, ()>(())).expect("a replay");
+    let report = replay(&flight, &mut Echo, &budget(), tracker, guard, |_| Ok::<_, ()>(())).expect("a replay");
     assert_eq!(report.metrics.fixes, 5, "gates off");
 }

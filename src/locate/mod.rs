@@ -25,6 +25,8 @@ mod search;
 mod stages;
 mod windows;
 
+pub(crate) use budget::{largest_sigma_m, tilt_was_assumed};
+
 pub use answer::{Answer, Evidence, Fix, Latency, NoFix, Reason, StageName, WindowInfo};
 pub use inputs::{FrameView, WindowView};
 pub use ladder::Ladder;

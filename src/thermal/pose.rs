@@ -39,8 +39,9 @@ impl CameraModel {
     /// Vehicle attitude in `pose` -> camera attitude, by the mount's rotation: `R_camera = R_vehicle R_mount`. The field of
     /// view is filled in where the pose states none.
     ///
-    /// Unknown stays unknown: without a yaw the camera has none; without pitch and roll the vehicle counts as level, and the
-    /// camera's stay unknown unless the mount itself is tilted. The camera's yaw comes out in 0..360.
+    /// Without a yaw the camera has none. Where the vehicle's pitch or roll is unknown it counts as level, and the mount's tilt
+    /// is the camera's; how well that is known is [`Pose::tilt_known`] of the vehicle's pose, not of what comes out. The
+    /// camera's yaw comes out in 0..360.
     pub fn camera_pose(&self, pose: &Pose) -> Pose {
         let pose = Pose { hfov_deg: pose.hfov_deg.or(self.hfov_deg), ..*pose };
         let mount = Attitude { yaw_deg: self.mount_yaw_deg, pitch_deg: self.mount_pitch_deg, roll_deg: self.mount_roll_deg };
@@ -53,17 +54,22 @@ impl CameraModel {
             roll_deg: pose.roll_deg.unwrap_or(0.0),
         };
         let camera = Attitude::of_rotation(&(vehicle.rotation() * mount.rotation()));
-        let tilt_known = pose.pitch_deg.is_some() || pose.roll_deg.is_some() || mount.pitch_deg != 0.0 || mount.roll_deg != 0.0;
+        let tilted = pose.pitch_deg.is_some() || pose.roll_deg.is_some() || mount.pitch_deg != 0.0 || mount.roll_deg != 0.0;
         Pose {
             yaw_deg: pose.yaw_deg.map(|_| camera.yaw_deg),
-            pitch_deg: tilt_known.then_some(camera.pitch_deg),
-            roll_deg: tilt_known.then_some(camera.roll_deg),
+            pitch_deg: tilted.then_some(camera.pitch_deg),
+            roll_deg: tilted.then_some(camera.roll_deg),
             ..pose
         }
     }
 }
 
 impl Pose {
+    /// Whether pitch and roll are both given.
+    pub fn tilt_known(&self) -> bool {
+        self.pitch_deg.is_some() && self.roll_deg.is_some()
+    }
+
     /// Ground under `side_px` pixels at nadir, metres, of a frame `width_px` wide; `None` where height and field of view do
     /// not say.
     pub fn footprint_m(&self, side_px: u32, width_px: u32) -> Option<f64> {
@@ -171,6 +177,8 @@ mod tests {
         assert_eq!(turned.camera_pose(&Pose { pitch_deg: Some(3.0), ..Pose::default() }).yaw_deg, None);
         let tilted = CameraModel { mount_pitch_deg: 10.0, ..none };
         assert!(close(tilted.camera_pose(&Pose::default()).pitch_deg, 10.0));
+        assert!(!Pose::default().tilt_known() && !Pose { roll_deg: Some(0.0), ..Pose::default() }.tilt_known());
+        assert!(pose(0.0, 0.0, 0.0).tilt_known());
     }
 
     proptest! {

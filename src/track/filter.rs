@@ -2,7 +2,7 @@
 //!
 //! State: east, north (metres, about the first fix), and their speeds. Motion: white acceleration of `track_accel_mps2`. A fix
 //! whose squared innovation, in units of its covariance (2 degrees of freedom), exceeds `track_gate` is left out; after
-//! `track_restart_after` in a row, or `fall_back_after_s` without one, the track begins anew. Each fix gives the state then, and
+//! `track_restart_after` in a row, or `fall_back_after_s` without one or back in time, the track begins anew. Each fix gives the state then, and
 //! what is known by then of the fix `track_lag_fixes` before it: Rauch, Tung and Striebel's backward pass over those kept.
 //!
 //! Consecutive fixes share the map's error and part of the tilt's, so their errors do not average out: the covariance here is
@@ -27,6 +27,7 @@ struct Step {
     state: (Vector4<f64>, Matrix4<f64>),
     /// What of the covariance is common to neighbouring fixes, square metres per axis.
     common_m2: f64,
+    calibrated: bool,
 }
 
 /// The track so far.
@@ -45,8 +46,8 @@ impl TrackFilter {
         Self { settings, origin, steps: VecDeque::new(), left_out: 0 }
     }
 
-    /// Takes an answer; the track's message where it is a fix that the track goes on with. Fixes older than the last are
-    /// left out.
+    /// Takes an answer; the track's message where it is a fix that the track goes on with. Fixes a little older than the last
+    /// are left out.
     pub fn take(&mut self, fix: &FixMessage) -> Option<TrackMessage> {
         let (position, covariance) = (fix.position()?, fix.covariance_enu_m2?);
         let covariance = Matrix2::from(covariance).transpose();
@@ -55,7 +56,7 @@ impl TrackFilter {
         }
         let dt_s = self.steps.back().map(|last| age_s(fix.stamp_ns, last.stamp_ns));
         let innovation = match dt_s {
-            Some(dt_s) if dt_s <= 0.0 && -dt_s <= self.settings.max_prior_age_s => return None,
+            Some(dt_s) if dt_s <= 0.0 && -dt_s <= self.settings.fall_back_after_s => return None,
             Some(dt_s) if dt_s > 0.0 && dt_s <= self.settings.fall_back_after_s => self.step(fix, position, &covariance, dt_s),
             _ => None,
         };
@@ -91,8 +92,8 @@ impl TrackFilter {
         wide.fixed_view_mut::<2, 2>(0, 0).copy_from(covariance);
         let state = (Vector4::zeros(), wide);
         let common_m2 = common_m2(fix, covariance);
-        let (stamp_ns, seq, motion) = (fix.stamp_ns, fix.seq, Matrix4::identity());
-        self.steps.push_back(Step { stamp_ns, seq, motion, predicted: state, state, common_m2 });
+        let (stamp_ns, seq, motion, calibrated) = (fix.stamp_ns, fix.seq, Matrix4::identity(), fix.calibrated);
+        self.steps.push_back(Step { stamp_ns, seq, motion, predicted: state, state, common_m2, calibrated });
     }
 
     /// Predicts to the fix and corrects with it; also the squared normalised innovation.
@@ -122,7 +123,8 @@ impl TrackFilter {
         let state = (predicted.0 + gain * innovation, p);
         let common_m2 = common_m2(fix, covariance);
         let nis = (innovation.transpose() * inverse * innovation)[(0, 0)];
-        Some((nis, Step { stamp_ns: fix.stamp_ns, seq: fix.seq, motion, predicted, state, common_m2 }))
+        let (stamp_ns, seq, calibrated) = (fix.stamp_ns, fix.seq, fix.calibrated);
+        Some((nis, Step { stamp_ns, seq, motion, predicted, state, common_m2, calibrated }))
     }
 
     /// The oldest fix kept, in the light of all after it.
@@ -157,6 +159,7 @@ impl TrackFilter {
             covariance_enu_m2: with_common(&now.1, last.common_m2),
             velocity_enu_mps: [now.0[2], now.0[3]],
             innovation_nees,
+            calibrated: self.steps.iter().all(|step| step.calibrated),
             lagged: LaggedState {
                 stamp_ns: first.stamp_ns,
                 fix_seq: first.seq,

@@ -115,6 +115,20 @@ fn what_neighbours_share_is_not_averaged_away() {
 }
 
 #[test]
+fn calibrated_is_what_rests_on_calibrated_fixes_alone() {
+    let mut filter = TrackFilter::new(settings());
+    let said: Vec<bool> = (0..14)
+        .map(|i| {
+            let calibrated = i != 3;
+            filter.take(&FixMessage { calibrated, ..fix(i * S, i as u64, Enu::default(), 5.0) }).unwrap().calibrated
+        })
+        .collect();
+    let lag = i64::from(settings().track_lag_fixes);
+    let expected: Vec<bool> = (0..14).map(|i| !(3..=3 + lag).contains(&i)).collect();
+    assert_eq!(said, expected);
+}
+
+#[test]
 fn gaps_old_fixes_and_numbers_that_are_none() {
     let mut filter = TrackFilter::new(settings());
     assert!(filter.take(&fix(100 * S, 1, Enu::default(), 5.0)).is_some());
@@ -122,6 +136,11 @@ fn gaps_old_fixes_and_numbers_that_are_none() {
     assert!(filter.take(&fix(100 * S, 3, Enu::default(), 5.0)).is_none(), "the same exposure");
     let after = filter.take(&fix(200 * S, 4, Enu { east_m: 2000.0, north_m: 0.0 }, 5.0)).unwrap();
     assert_eq!((after.innovation_nees, after.lagged.fix_seq), (None, 4), "a gap begins anew");
+    assert!(filter.take(&fix(170 * S, 4, Enu::default(), 5.0)).is_none(), "30 s older than the last");
+    // One that was stamped far ahead, or a clock that stepped back, silences nothing for long.
+    assert!(filter.take(&fix(700 * S, 4, Enu::default(), 5.0)).is_some());
+    let back = filter.take(&fix(201 * S, 4, Enu::default(), 5.0)).unwrap();
+    assert_eq!((back.innovation_nees, back.stamp_ns), (None, 201 * S));
     for sigma_m in [f64::NAN, f64::INFINITY, 0.0] {
         assert!(filter.take(&fix(201 * S, 5, Enu::default(), sigma_m)).is_none());
     }

@@ -1,31 +1,39 @@
 //! Consistency over frames: what no motion explains is held back until another frame agrees, a frozen picture is no news.
 //!
 //! Rules, each about one answer, in the order in which they are tested:
-//! 1. The same picture again, bit for bit, at another exposure: its fix holds for the first exposure, so its stated error
-//!    grows by `max_speed_mps` x the time since; from `frozen_frames` in a row, over `frozen_after_s`, on it is
+//! 1. One of the last few pictures again, bit for bit, at another exposure: its fix holds for the first exposure, so its stated
+//!    error grows by `max_speed_mps` x the time since; from the `frozen_frames`-th exposure, over `frozen_after_s`, on it is
 //!    `held_back`.
-//! 2. A fix further from the published one nearest in time than motion allows is `held_back`; but not where a new external
+//! 2. A fix outside the disc of the external prior nearest in time, grown by its age, is `held_back`, whichever prior led to
+//!    it: a chain of own fixes does not outlive what others know. It confirms nothing.
+//! 3. A fix further from the published one nearest in time than motion allows is `held_back`; but not where a new external
 //!    prior came with it from a source that jumps itself (independent places, a restarted estimator). A source is taken as
-//!    continuous where its last `steady_reports` steps were such as the vehicle can fly.
-//! 3. A fix that was searched for beyond the bundle's D_C is always held back, 2. or not.
-//! 4. What 2. and 3. hold back is published where `confirmations` earlier answers of other ground agree with it: of other
-//!    ground, so that one picture does not confirm itself; for a searched one only where agreement by chance is rare.
+//!    continuous where it made a step, and its last `steady_reports` ones were such as the vehicle can fly.
+//! 4. A fix that was searched for beyond the bundle's D_C is always held back, 3. or not.
+//! 5. What 3. and 4. hold back is published where `confirmations` earlier answers of other ground agree with it: of other
+//!    ground, so that one picture does not confirm itself; for a searched one only where agreement by chance is rare. A jump
+//!    is published as well where time alone lies between (`confirm_after_s`: a vehicle may hover), but no calibration
+//!    covers it, nor what follows until the vehicle is on other ground. What a search found for a vehicle that hovers stays held back.
 //!
 //! Goes between [`crate::locate::Localizer`] and [`super::Tracker::record`]: what is held back becomes no own prior. No
 //! clock: time is what stamps say, in whatever order they come.
 
 use super::recent::Recent;
-use super::tracker::{age_s, largest_sigma_m};
+use super::tracker::age_s;
 use crate::config::TrackSettings;
 use crate::geo::LatLon;
-use crate::locate::{Answer, Fix, NoFix, Prior, PriorSource, Reason};
+use crate::locate::{Answer, Fix, NoFix, Prior, PriorSource, Reason, largest_sigma_m};
 use sha2::{Digest, Sha256};
 use std::collections::VecDeque;
 
 /// Published and held answers kept of each: enough for frames that come out of order.
 const KEPT: usize = 16;
+/// Pictures remembered: enough for a driver that goes round in its buffers.
+const PICTURES: usize = 16;
 /// Stamps of one report, computed from its age, differ by rounding only.
 const SAME_REPORT_NS: u64 = 1_000;
+/// Of a distance, relative.
+const ROUNDING: f64 = 1e-9;
 
 /// An external prior, as the frames that used it tell.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -44,13 +52,13 @@ struct Place {
     report: Option<Report>,
 }
 
-/// The picture last seen, and since when.
+/// A picture, and since when it is seen.
 #[derive(Debug, Clone)]
 struct Picture {
     digest: [u8; 32],
     first_stamp_ns: i64,
     last_stamp_ns: i64,
-    /// In a row, at different exposures.
+    /// At different exposures.
     count: u32,
 }
 
@@ -61,21 +69,24 @@ pub struct Guard {
     enabled: bool,
     published: Recent<Place>,
     held: Recent<Place>,
+    /// Where a jump was published that time alone confirmed, until the vehicle is on other ground.
+    doubtful: Option<LatLon>,
     /// External reports in the order of their stamps, the last few.
     reports: VecDeque<Report>,
-    picture: Option<Picture>,
+    /// The last to be seen at the back.
+    pictures: VecDeque<Picture>,
 }
 
 impl Guard {
     /// Nothing seen yet. Not `enabled` (gates off): nothing is held back.
     pub fn new(settings: TrackSettings, enabled: bool) -> Self {
         let (published, held) = (Recent::new(KEPT), Recent::new(KEPT));
-        Self { settings, enabled, published, held, reports: VecDeque::new(), picture: None }
+        Self { settings, enabled, published, held, doubtful: None, reports: VecDeque::new(), pictures: VecDeque::new() }
     }
 
-    /// Judges the answer for a frame exposed at `stamp_ns` (`frame`: its bytes as they came, where it has any): a fix may
-    /// become `held_back`, or its stated error wider.
-    pub fn judge(&mut self, stamp_ns: i64, frame: Option<&[u8]>, answer: &mut Answer) {
+    /// Judges the answer for a frame exposed at `stamp_ns` (`frame`: its bytes as they came, where it has any; `external`:
+    /// [`super::Tracker::external_at`] by then): a fix may become `held_back`, or its stated error wider.
+    pub fn judge(&mut self, stamp_ns: i64, frame: Option<&[u8]>, external: Option<&Prior>, answer: &mut Answer) {
         if !self.enabled {
             return;
         }
@@ -84,9 +95,13 @@ impl Guard {
         let Ok(fix) = &mut answer.outcome else { return };
         if repeats >= self.settings.frozen_frames && picture_age_s >= self.settings.frozen_after_s {
             let detail = format!(
-                "frame: expected a new picture, found the same one bit for bit, {repeats} in a row over {picture_age_s:.3} s: \
+                "frame: expected a new picture, found the same one bit for bit at {repeats} exposures over {picture_age_s:.3} s: \
                  the camera is frozen"
             );
+            answer.outcome = Err(NoFix::new(Reason::HeldBack, detail));
+            return;
+        }
+        if let Some(detail) = external.and_then(|external| contradicts(external, fix.position)) {
             answer.outcome = Err(NoFix::new(Reason::HeldBack, detail));
             return;
         }
@@ -98,7 +113,13 @@ impl Guard {
         let place = Place { position, sigma_m: largest_sigma_m(&fix.covariance_enu_m2), report: self.reports.back().copied() };
         let searched_m = answer.searched.then_some(answer.prior.map_or(0.0, |prior| prior.radius_m));
         match self.weigh(stamp_ns, &place, report, searched_m) {
-            Ok(()) => {
+            Ok(confirmed) => {
+                let settled_m = self.settings.confirm_distance_m;
+                let since = self.doubtful.filter(|since| since.distance_m(position) < settled_m);
+                self.doubtful = if confirmed { since } else { Some(position) };
+                if self.doubtful.is_some() {
+                    (fix.calibrated, fix.p_over_25m) = (false, None);
+                }
                 // What the track went past confirms nothing any more.
                 self.held.clear();
                 self.published.push(stamp_ns, place);
@@ -110,17 +131,21 @@ impl Guard {
         }
     }
 
-    /// Published, or the words why not.
-    fn weigh(&self, stamp_ns: i64, place: &Place, new: Option<Report>, searched_m: Option<f64>) -> Result<(), String> {
+    /// Published, and whether more than time speaks for it; or the words why not.
+    fn weigh(&self, stamp_ns: i64, place: &Place, new: Option<Report>, searched_m: Option<f64>) -> Result<bool, String> {
         let jump = self.unexplained(stamp_ns, place, new);
         if jump.is_none() && searched_m.is_none() {
-            return Ok(());
+            return Ok(true);
         }
         // An older fix says nothing for a jump that the nearest one speaks against.
         let published = self.published.nearest(stamp_ns).filter(|_| jump.is_none());
-        let (agreed, needed) = (self.agreeing(stamp_ns, place, published, searched_m), self.settings.confirmations as usize);
+        let agreeing = |after_s: f64| self.agreeing(stamp_ns, place, published, searched_m, after_s);
+        let (agreed, needed) = (agreeing(f64::INFINITY), self.settings.confirmations as usize);
         if agreed >= needed {
-            return Ok(());
+            return Ok(true);
+        }
+        if searched_m.is_none() && agreeing(self.settings.confirm_after_s) >= needed {
+            return Ok(false);
         }
         let what = jump.unwrap_or_else(|| "position found by a search".to_owned());
         Err(format!("{what}; expected {needed} earlier answers of other ground that agree, found {agreed}"))
@@ -142,12 +167,19 @@ impl Guard {
         Some(format!("distance from the fix {age_s:.2} s before: expected at most {reach_m:.1} m, found {distance_m:.1} m"))
     }
 
-    /// How many earlier answers, held back or `published`, agree, each of other ground than this one and than the others.
-    fn agreeing(&self, stamp_ns: i64, place: &Place, published: Option<(i64, &Place)>, searched_m: Option<f64>) -> usize {
+    /// How many earlier answers, held back or `published`, agree, each of other ground than this one and than the others, or
+    /// `after_s` from them.
+    fn agreeing(
+        &self,
+        stamp_ns: i64,
+        place: &Place,
+        published: Option<(i64, &Place)>,
+        searched_m: Option<f64>,
+        after_s: f64,
+    ) -> usize {
         let settings = &self.settings;
         let other_ground = |(a_ns, a): (i64, &Place), (b_ns, b): (i64, &Place)| {
-            age_s(a_ns, b_ns).abs() >= settings.confirm_after_s
-                || a.position.distance_m(b.position) >= settings.confirm_distance_m
+            age_s(a_ns, b_ns).abs() >= after_s || a.position.distance_m(b.position) >= settings.confirm_distance_m
         };
         let mut counted: Vec<(i64, &Place)> = Vec::new();
         for (at_ns, earlier) in self.held.newest_first().chain(published) {
@@ -170,24 +202,25 @@ impl Guard {
         settings.max_speed_mps * age_s(a_ns, b_ns).abs() + 3.0 * (a.sigma_m + b.sigma_m) + settings.jump_slack_m
     }
 
-    /// Remembers the picture; how many in a row it was seen, at different exposures, and the seconds since the first.
+    /// Remembers the picture; at how many exposures it was seen, and the seconds since the first. Where there is none, what was
+    /// seen stays.
     fn look(&mut self, stamp_ns: i64, frame: Option<&[u8]>) -> (u32, f64) {
-        let Some(bytes) = frame else {
-            self.picture = None;
-            return (0, 0.0);
-        };
+        let Some(bytes) = frame else { return (0, 0.0) };
         let digest: [u8; 32] = Sha256::digest(bytes).into();
-        let Some(seen) = self.picture.as_mut().filter(|seen| seen.digest == digest) else {
-            self.picture = Some(Picture { digest, first_stamp_ns: stamp_ns, last_stamp_ns: stamp_ns, count: 1 });
-            return (1, 0.0);
-        };
+        let known = self.pictures.iter().position(|seen| seen.digest == digest).and_then(|i| self.pictures.remove(i));
+        let mut seen = known.unwrap_or(Picture { digest, first_stamp_ns: stamp_ns, last_stamp_ns: stamp_ns, count: 1 });
         // One exposure sent twice is no frozen camera.
         if seen.last_stamp_ns != stamp_ns {
             seen.count = seen.count.saturating_add(1);
             seen.last_stamp_ns = stamp_ns;
         }
         let count = if seen.first_stamp_ns == stamp_ns { 1 } else { seen.count };
-        (count, age_s(stamp_ns, seen.first_stamp_ns).abs())
+        let age_s = age_s(stamp_ns, seen.first_stamp_ns).abs();
+        self.pictures.push_back(seen);
+        if self.pictures.len() > PICTURES {
+            self.pictures.pop_front();
+        }
+        (count, age_s)
     }
 
     /// Remembers the external report that a prior rests on, and gives it.
@@ -217,15 +250,27 @@ impl Guard {
         age_s(last.stamp_ns, report.stamp_ns) > self.settings.max_prior_age_s
     }
 
-    /// Whether the external priors moved as a vehicle does, over the last `steady_reports` steps.
+    /// Whether the external priors moved as a vehicle does, over the last `steady_reports` steps or as many as there are.
     fn source_is_continuous(&self) -> bool {
-        let steps = self.reports.iter().zip(self.reports.iter().skip(1));
-        let steps = steps.filter(|(a, b)| {
+        let mut steps = self.reports.iter().zip(self.reports.iter().skip(1));
+        let flyable = |(a, b): (&Report, &Report)| {
             let reach_m = self.settings.max_speed_mps * age_s(b.stamp_ns, a.stamp_ns).abs() + self.settings.jump_slack_m;
             a.position.distance_m(b.position) <= reach_m
-        });
-        steps.count() >= self.settings.steady_reports as usize
+        };
+        self.reports.len() > 1 && steps.all(flyable)
     }
+}
+
+/// The words where a fix lies outside what an external prior allows.
+fn contradicts(external: &Prior, position: LatLon) -> Option<String> {
+    let (radius_m, distance_m) = (external.radius_m, external.position.distance_m(position));
+    let within = distance_m <= radius_m * (1.0 + ROUNDING);
+    let age_s = external.age_s.unwrap_or(0.0);
+    (!within).then(|| {
+        format!(
+            "distance from the external prior of {age_s:.2} s before: expected at most {radius_m:.1} m, found {distance_m:.1} m"
+        )
+    })
 }
 
 /// Whether two are one report.

@@ -61,7 +61,7 @@ fn searched(at: LatLon, radius_m: f64) -> Answer {
 
 /// What becomes of an answer whose picture is a new one.
 fn judge(guard: &mut Guard, stamp_ns: i64, mut answer: Answer) -> Result<Fix, NoFix> {
-    guard.judge(stamp_ns, None, &mut answer);
+    guard.judge(stamp_ns, None, None, &mut answer);
     answer.outcome
 }
 
@@ -85,17 +85,39 @@ fn a_jump_is_held_back_until_other_ground_agrees() {
     assert!(track(&mut guard, T0 + 4 * S, 80.0));
     assert!(!track(&mut guard, T0 + 5 * S, 300.0));
     assert!(!track(&mut guard, T0 + 5 * S + S / 2, 305.0), "5 m and half a second on is the same ground");
-    assert!(track(&mut guard, T0 + 6 * S, 345.0), "45 m on is not");
+    assert_eq!(calibrated(&mut guard, T0 + 6 * S, 345.0), Some(true), "45 m on is not");
     assert!(track(&mut guard, T0 + 7 * S, 360.0));
 }
 
+/// Whether a fix at this place, with an own prior, is published as calibrated; None: held back.
+fn calibrated(guard: &mut Guard, stamp_ns: i64, east_m: f64) -> Option<bool> {
+    let at = place(east_m, 0.0);
+    let fix = judge(guard, stamp_ns, answer(at, own(at))).ok()?;
+    assert_eq!(fix.p_over_25m.is_some(), fix.calibrated);
+    Some(fix.calibrated)
+}
+
 #[test]
-fn a_place_that_stands_still_is_confirmed_later() {
+fn a_place_that_stands_still_is_confirmed_later_and_not_calibrated_before_it_moves() {
     let mut guard = guard();
-    assert!(track(&mut guard, T0, 0.0));
-    assert!(!track(&mut guard, T0 + S, 400.0));
-    assert!(!track(&mut guard, T0 + 2 * S, 400.0));
-    assert!(track(&mut guard, T0 + 3 * S, 401.0));
+    assert_eq!(calibrated(&mut guard, T0, 0.0), Some(true));
+    assert_eq!(calibrated(&mut guard, T0 + S, 400.0), None);
+    assert_eq!(calibrated(&mut guard, T0 + 2 * S, 400.0), None);
+    assert_eq!(calibrated(&mut guard, T0 + 3 * S, 401.0), Some(false));
+    assert_eq!(calibrated(&mut guard, T0 + 4 * S, 420.0), Some(false));
+    assert_eq!(calibrated(&mut guard, T0 + 6 * S, 440.9), Some(false), "39.9 m on");
+    assert_eq!(calibrated(&mut guard, T0 + 7 * S, 441.1), Some(true));
+    assert_eq!(calibrated(&mut guard, T0 + 8 * S, 402.0), Some(true), "once settled it stays so");
+}
+
+#[test]
+fn a_searched_place_of_a_vehicle_that_hovers_stays_held() {
+    let mut guard = guard();
+    for i in 0..20 {
+        assert!(judge(&mut guard, T0 + i * S, searched(place(1500.0 + (i % 2) as f64, 0.0), 3000.0)).is_err());
+    }
+    let moved = judge(&mut guard, T0 + 21 * S, searched(place(1542.0, 0.0), 3000.0));
+    assert!(moved.is_ok());
 }
 
 #[test]
@@ -157,6 +179,18 @@ fn a_continuous_source_explains_no_jump_and_one_that_restarts_does() {
 }
 
 #[test]
+fn one_step_that_can_be_flown_makes_a_source_continuous() {
+    let mut guard = guard();
+    for i in 0..2 {
+        let at = place(20.0 * f64::from(i), 0.0);
+        let outcome = judge(&mut guard, T0 + i64::from(i) * S, answer(at, external(at, 512.0, 0.0)));
+        assert!(outcome.is_ok());
+    }
+    let jump = judge(&mut guard, T0 + 2 * S, answer(place(40.0, 400.0), external(place(40.0, 0.0), 512.0, 0.0)));
+    assert_eq!(jump.unwrap_err().reason, Reason::HeldBack);
+}
+
+#[test]
 fn a_report_that_an_unanswered_frame_used_is_still_new() {
     let mut guard = guard();
     assert!(judge(&mut guard, T0, answer(place(0.0, 0.0), external(place(0.0, 0.0), 300.0, 0.0))).is_ok());
@@ -177,7 +211,7 @@ fn a_searched_place_needs_a_second_frame_of_other_ground() {
     assert!(judge(&mut guard, T0 + S, searched(near(1.0), 3000.0)).is_err(), "20 m and 1 s: the same ground");
     assert!(judge(&mut guard, T0 + 2 * S, searched(place(-900.0, 500.0), 3000.0)).is_err(), "elsewhere");
     let mut second = searched(near(3.0), 3000.0);
-    guard.judge(T0 + 3 * S, None, &mut second);
+    guard.judge(T0 + 3 * S, None, None, &mut second);
     assert!(second.outcome.is_ok() && second.searched);
     // A published fix confirms too; and what was not searched for needs none.
     assert!(judge(&mut guard, T0 + 6 * S, searched(near(6.0), 3000.0)).is_ok());
@@ -200,7 +234,7 @@ fn agreement_that_chance_gives_confirms_no_search() {
 
 fn look(guard: &mut Guard, stamp_ns: i64, picture: &[u8]) -> Answer {
     let mut answer = answer(place(0.0, 0.0), own(place(0.0, 0.0)));
-    guard.judge(stamp_ns, Some(picture), &mut answer);
+    guard.judge(stamp_ns, Some(picture), None, &mut answer);
     answer
 }
 
@@ -219,9 +253,24 @@ fn a_frozen_camera_widens_then_closes_and_a_new_picture_opens() {
         assert!(refused.detail.contains("frozen"), "{}", refused.detail);
     }
     assert!(look(&mut guard, T0 + 6 * S, b"two").outcome.unwrap().calibrated);
-    // Not in a row: a file that comes up again much later is a picture as any.
+    // It is remembered over others and over frames without bytes, until 16 others were seen since.
+    assert_eq!(look(&mut guard, T0 + 7 * S, b"one").outcome.unwrap_err().reason, Reason::HeldBack);
+    let mut none = answer(place(0.0, 0.0), own(place(0.0, 0.0)));
+    guard.judge(T0 + 8 * S, None, None, &mut none);
+    assert_eq!(look(&mut guard, T0 + 9 * S, b"one").outcome.unwrap_err().reason, Reason::HeldBack);
+    for i in 0..16 {
+        assert!(look(&mut guard, T0 + (10 + i) * S, &[i as u8]).outcome.unwrap().calibrated);
+    }
     assert!(look(&mut guard, T0 + 900 * S, b"one").outcome.unwrap().calibrated);
-    assert!(look(&mut guard, T0 + 901 * S, b"two").outcome.unwrap().calibrated);
+}
+
+#[test]
+fn a_driver_that_goes_round_in_its_buffers_is_frozen_too() {
+    let mut guard = Guard::new(TrackSettings { frozen_frames: 10, ..settings() }, true);
+    let outcomes: Vec<_> = (0..40).map(|i: i64| look(&mut guard, T0 + i * S / 9, &[(i % 3) as u8]).outcome).collect();
+    assert!(outcomes[..3].iter().all(|outcome| outcome.as_ref().unwrap().calibrated));
+    assert!(outcomes[3..27].iter().all(|outcome| !outcome.as_ref().unwrap().calibrated));
+    assert!(outcomes[27..].iter().all(|outcome| outcome.as_ref().unwrap_err().detail.contains("frozen")));
 }
 
 #[test]
@@ -244,7 +293,7 @@ fn switched_off_it_changes_nothing() {
     for i in 0..5 {
         let before = Answer { searched: true, ..answer(place(5000.0 * i as f64, 0.0), own(place(0.0, 0.0))) };
         let mut after = before.clone();
-        guard.judge(T0 + i * S, Some(b"same"), &mut after);
+        guard.judge(T0 + i * S, Some(b"same"), Some(&external(place(0.0, 0.0), 10.0, 0.0)), &mut after);
         assert_eq!(before, after);
     }
 }
@@ -258,11 +307,36 @@ fn what_is_held_back_is_no_prior() {
     for (seq, east_m) in [(0, 0.0), (1, 400.0)] {
         let stamp_ns = T0 + i64::try_from(seq).unwrap() * S;
         let mut answer = answer(place(east_m, 0.0), tracker.prior_at(stamp_ns).unwrap());
-        guard.judge(stamp_ns, None, &mut answer);
+        guard.judge(stamp_ns, None, None, &mut answer);
         tracker.record(stamp_ns, seq, &answer);
     }
     let prior = tracker.prior_at(T0 + 2 * S).unwrap();
     assert_eq!((prior.source, prior.position), (PriorSource::OwnFix, place(0.0, 0.0)));
+}
+
+#[test]
+fn a_fix_outside_the_external_disc_is_held_back_and_confirms_nothing() {
+    let mut guard = guard();
+    let stale = answer(place(0.0, 0.0), own(place(0.0, 0.0)));
+    let bound = |east_m: f64, radius_m: f64| external(place(east_m, 0.0), radius_m, 0.25);
+    let judge = |guard: &mut Guard, i: i64, bound: Prior| {
+        let mut answer = stale.clone();
+        guard.judge(T0 + i * 4 * S, None, Some(&bound), &mut answer);
+        answer.outcome
+    };
+    assert!(judge(&mut guard, 0, bound(99.9, 100.0)).is_ok());
+    for i in 1..4 {
+        let refused = judge(&mut guard, i, bound(101.0, 100.0)).unwrap_err();
+        assert_eq!(refused.reason, Reason::HeldBack);
+        assert!(
+            refused.detail.contains("external prior of 0.25 s before") && refused.detail.contains("found 101"),
+            "{}",
+            refused.detail
+        );
+    }
+    assert!(guard.held.newest_first().next().is_none());
+    assert!(judge(&mut guard, 4, bound(300.0, 400.0)).is_ok(), "an old prior has a wide disc");
+    assert!(judge(&mut guard, 5, bound(0.0, f64::NAN)).is_err());
 }
 
 #[test]
@@ -347,17 +421,20 @@ proptest! {
         }
     }
 
-    /// Independent places, each with its own external prior, are all published.
+    /// Independent places, each with its own external prior, are all published: their priors are no flight.
     #[test]
     fn independent_places_are_published(
-        places in prop::collection::vec((-4000.0..4000.0, -4000.0..4000.0, 0.0..512.0, 0.0..360.0), 1..60),
+        steps in prop::collection::vec((300.0..6000.0, 0.0..360.0, 0.0..120.0, 0.0..360.0), 1..60),
     ) {
-        let mut guard = guard();
-        for (i, (east_m, north_m, off_m, to_deg)) in places.into_iter().enumerate() {
-            let at = place(east_m, north_m);
+        let (mut guard, mut at) = (guard(), place(0.0, 0.0));
+        let towards = |m: f64, to_deg: f64| {
             let (sin, cos) = f64::to_radians(to_deg).sin_cos();
-            let prior = external(at.offset(Enu { east_m: off_m * sin, north_m: off_m * cos }), 512.0, 0.0);
-            prop_assert!(judge(&mut guard, T0 + i as i64 * 10 * S, answer(at, prior)).is_ok());
+            Enu { east_m: m * sin, north_m: m * cos }
+        };
+        for (i, (step_m, to_deg, off_m, off_deg)) in steps.into_iter().enumerate() {
+            at = at.offset(towards(step_m, to_deg));
+            let prior = external(at.offset(towards(off_m, off_deg)), 512.0, 0.0);
+            prop_assert!(judge(&mut guard, T0 + i as i64 * S, answer(at, prior)).is_ok());
         }
     }
 

@@ -2,8 +2,11 @@
 
 use std::collections::VecDeque;
 
+/// A stamp so long before that of the last to arrive is no disorder: the clock stepped back.
+const STEP_NS: u64 = 1_000_000_000;
+
 /// At most `capacity` stamped things; the oldest by arrival gives way. Arrival, not stamps, so that a clock that
-/// stepped back cannot make the past immortal.
+/// stepped back cannot make the past immortal; and what is stamped later than a step's first stamp is forgotten.
 #[derive(Debug, Clone)]
 pub(crate) struct Recent<T> {
     capacity: usize,
@@ -18,6 +21,10 @@ impl<T> Recent<T> {
 
     /// Adds one.
     pub fn push(&mut self, stamp_ns: i64, item: T) {
+        let last_ns = self.items.back().map_or(stamp_ns, |(at, _)| *at);
+        if stamp_ns < last_ns && last_ns.abs_diff(stamp_ns) > STEP_NS {
+            self.items.retain(|(at, _)| *at <= stamp_ns);
+        }
         if self.items.len() >= self.capacity {
             self.items.pop_front();
         }
@@ -67,5 +74,21 @@ mod tests {
         assert_eq!(recent.around(20), (Some((20, &'d')), Some((20, &'d'))));
         recent.clear();
         assert_eq!(recent.nearest(20), None);
+    }
+
+    #[test]
+    fn a_step_back_forgets_the_future_and_disorder_does_not() {
+        const S: i64 = 1_000_000_000;
+        let mut recent = Recent::new(8);
+        for (stamp_ns, item) in [(7 * S, 'a'), (10 * S, 'b'), (9 * S, 'c')] {
+            recent.push(stamp_ns, item);
+        }
+        assert_eq!(recent.nearest(10 * S), Some((10 * S, &'b')), "a second before is out of order");
+        recent.push(8 * S - 1, 'd');
+        assert_eq!(recent.nearest(10 * S), Some((8 * S - 1, &'d')), "more is a step");
+        assert_eq!(recent.nearest(7 * S), Some((7 * S, &'a')));
+        recent.push(i64::MAX, 'e');
+        recent.push(i64::MIN, 'f');
+        assert_eq!(recent.newest_first().collect::<Vec<_>>(), [(i64::MIN, &'f')]);
     }
 }

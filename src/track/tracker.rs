@@ -5,15 +5,20 @@
 //!    is stale. A report that echoes one of our fixes is not external.
 //! 2. The *own* prior is the own fix, or the echo of one, nearest to t: per-axis sigma at least `own_fix_sigma_m`,
 //!    grown alike. It is gone `fall_back_after_s` after the fix, and after `fall_back_after_no_fix` "no fix" in a row.
-//! 3. Of the two the one nearer to t is taken (at a tie the one that came later); but the other one where the first is
-//!    wider than the bundle can search and the other is not.
+//! 3. An echo of a fix that was given up (by those "no fix") is as wide as it says and `max_speed_mps` x the time since that
+//!    fix: what the estimator knew besides may be no more than that fix. Of a fix that is not remembered an echo counts as one
+//!    deep, until the first such loss; an echo of one older than those remembered is refused.
+//! 4. The one of 1. and 2. that is nearer to t is taken (at a tie the one that came later), then the other, then 3.: the first
+//!    that is not wider than the bundle can search, else the narrowest.
 //!
-//! Nothing here reads a clock: time is what stamps say, so a clock that steps costs at most the priors it makes stale.
+//! Nothing here reads a clock: time is what stamps say. A clock that steps forward costs the priors that it makes stale. One
+//! that steps back costs what is stamped later than the first report or fix after it (over a second: less is disorder);
+//! until that comes, the age of what is known is the stamps' difference, not the time that passed.
 
 use super::recent::Recent;
 use crate::config::TrackSettings;
 use crate::geo::LatLon;
-use crate::locate::{Answer, NoFix, Prior, PriorSource, Reason};
+use crate::locate::{Answer, NoFix, Prior, PriorSource, Reason, largest_sigma_m};
 
 /// External reports, own fixes and echoes kept of each: enough for frames that come out of order.
 const KEPT: usize = 64;
@@ -67,9 +72,11 @@ pub struct Tracker {
     search_radius_m: f64,
     external: Recent<Known>,
     own: Recent<Known>,
-    /// Own fixes whose echoes are believed.
+    /// Echoes of fixes given up.
+    given_up: Recent<Known>,
+    /// Own fixes, to recognise their echoes.
     fixes: Recent<OwnFix>,
-    /// Echoes of fixes before this one are not believed: tracking was lost since.
+    /// Fixes before this one are given up: tracking was lost since. 0: never lost.
     believed_from_seq: u64,
     no_fix_in_row: u32,
     arrivals: u64,
@@ -83,6 +90,7 @@ impl Tracker {
             search_radius_m: f64::INFINITY,
             external: Recent::new(KEPT),
             own: Recent::new(KEPT),
+            given_up: Recent::new(KEPT),
             fixes: Recent::new(KEPT),
             believed_from_seq: 0,
             no_fix_in_row: 0,
@@ -97,7 +105,7 @@ impl Tracker {
     }
 
     /// A prior came from outside. False, and nothing learnt, where a number is not finite or out of range, or where it
-    /// echoes a fix that is no longer believed.
+    /// echoes a fix of which too little is known.
     pub fn report(&mut self, prior: PriorReport) -> bool {
         let PriorReport { stamp_ns, position, spread, fix_seq } = prior;
         let width_m = match spread {
@@ -112,65 +120,73 @@ impl Tracker {
             self.external.push(stamp_ns, Known { position, spread, chain: 0, fix_stamp_ns: stamp_ns, arrival });
             return true;
         };
-        if seq < self.believed_from_seq {
-            return false;
-        }
-        // The echo of a fix we do not remember (of an earlier process, say) is still our own influence: how deep is
-        // unknown, so it counts as one.
-        let fix = self.fixes.newest_first().find(|(_, fix)| fix.seq == seq).map(|(stamp_ns, fix)| (stamp_ns, fix.chain));
-        let (fix_stamp_ns, chain) = fix.unwrap_or((stamp_ns, 0));
+        let Some((fix_stamp_ns, chain)) = self.echoed(seq, stamp_ns) else { return false };
+        let given_up = seq < self.believed_from_seq;
+        let since_m = if given_up { self.settings.max_speed_mps * age_s(stamp_ns, fix_stamp_ns).abs() } else { 0.0 };
         // An estimator that was told our fix cannot vouch for it: the floor of an own fix holds for its echo too.
         let floor_m = self.settings.own_fix_sigma_m;
         let spread = match spread {
-            Spread::SigmaM(m) => Spread::SigmaM(m.max(floor_m)),
-            Spread::RadiusM(m) => Spread::RadiusM(m.max(3.0 * floor_m)),
+            Spread::SigmaM(m) => Spread::SigmaM(m.max(floor_m) + since_m),
+            Spread::RadiusM(m) => Spread::RadiusM(m.max(3.0 * floor_m) + since_m),
         };
-        self.own.push(stamp_ns, Known { position, spread, chain: chain.saturating_add(1), fix_stamp_ns, arrival });
+        let echo = Known { position, spread, chain: chain.saturating_add(1), fix_stamp_ns, arrival };
+        if given_up { &mut self.given_up } else { &mut self.own }.push(stamp_ns, echo);
         true
+    }
+
+    /// Exposure and depth of the fix that is echoed at `stamp_ns`. One that is not remembered, of an earlier process say, is
+    /// still our own influence; after a loss it may be what led there.
+    fn echoed(&self, seq: u64, stamp_ns: i64) -> Option<(i64, u32)> {
+        let known = self.fixes.newest_first().find(|(_, fix)| fix.seq == seq).map(|(at, fix)| (at, fix.chain));
+        let oldest = self.fixes.newest_first().map(|(_, fix)| fix.seq).min();
+        let of_others = oldest.is_none_or(|oldest| seq > oldest) && self.believed_from_seq == 0;
+        known.or(of_others.then_some((stamp_ns, 0)))
     }
 
     /// The prior for a frame exposed at `stamp_ns`: own fix (sigma at least 50 m, grown by speed x age), or after 5
     /// "no fix" or 30 s the last external one, grown by its age. `no_prior` or `stale_prior` where there is none.
     pub fn prior_at(&self, stamp_ns: i64) -> Result<Prior, NoFix> {
-        let nearest_external = self.external.nearest(stamp_ns);
-        let external = nearest_external.filter(|(at, _)| age_s(stamp_ns, *at).abs() <= self.settings.max_prior_age_s);
-        let own = self
-            .own
-            .nearest(stamp_ns)
-            .filter(|(_, known)| age_s(stamp_ns, known.fix_stamp_ns).abs() <= self.settings.fall_back_after_s)
-            .filter(|(at, _)| age_s(stamp_ns, *at).abs() <= self.settings.fall_back_after_s);
-        let external = external.map(|(at, known)| (at, known.arrival, self.grown(stamp_ns, at, known)));
-        let own = own.map(|(at, known)| (at, known.arrival, self.grown(stamp_ns, at, known)));
-        match (external, own) {
-            (Some(a), Some(b)) => {
-                let nearer = |(at, arrival, _): (i64, u64, Prior)| (at.abs_diff(stamp_ns), u64::MAX - arrival);
-                let (first, other) = if nearer(a) < nearer(b) { (a.2, b.2) } else { (b.2, a.2) };
-                let too_wide = first.radius_m > self.search_radius_m && other.radius_m <= self.search_radius_m;
-                Ok(if too_wide { other } else { first })
-            }
-            (Some((_, _, prior)), None) | (None, Some((_, _, prior))) => Ok(prior),
-            (None, None) => Err(match nearest_external {
-                Some((at, _)) => NoFix {
-                    reason: Reason::StalePrior,
-                    detail: format!(
-                        "prior: expected at most {} s from the exposure, found {:.1} s",
-                        self.settings.max_prior_age_s,
-                        age_s(stamp_ns, at).abs()
-                    ),
-                },
-                None => NoFix { reason: Reason::NoPrior, detail: "prior: expected one from outside, found none".to_owned() },
-            }),
-        }
+        let recent = |at_ns: i64| age_s(stamp_ns, at_ns).abs() <= self.settings.fall_back_after_s;
+        let own = self.own.nearest(stamp_ns).filter(|(at, known)| recent(*at) && recent(known.fix_stamp_ns));
+        let given_up = self.given_up.nearest(stamp_ns).filter(|(at, _)| recent(*at));
+        let mut known: Vec<(i64, &Known)> = self.fresh_external(stamp_ns).into_iter().chain(own).collect();
+        known.sort_by_key(|(at, known)| (at.abs_diff(stamp_ns), u64::MAX - known.arrival));
+        let priors: Vec<Prior> = known.into_iter().chain(given_up).map(|(at, known)| self.grown(stamp_ns, at, known)).collect();
+        let narrow = priors.iter().find(|prior| prior.radius_m <= self.search_radius_m);
+        let prior = narrow.or_else(|| priors.iter().min_by(|a, b| a.radius_m.total_cmp(&b.radius_m)));
+        prior.copied().ok_or_else(|| self.no_prior_at(stamp_ns))
+    }
+
+    fn no_prior_at(&self, stamp_ns: i64) -> NoFix {
+        let Some((at_ns, _)) = self.external.nearest(stamp_ns) else {
+            return NoFix::new(Reason::NoPrior, "prior: expected one from outside, found none");
+        };
+        let (most_s, age_s) = (self.settings.max_prior_age_s, age_s(stamp_ns, at_ns).abs());
+        NoFix::new(Reason::StalePrior, format!("prior: expected at most {most_s} s from the exposure, found {age_s:.1} s"))
+    }
+
+    /// The external prior nearest to `stamp_ns`, grown to it, where it is not stale: no fix may lie outside its disc, whichever
+    /// prior led to the fix.
+    pub fn external_at(&self, stamp_ns: i64) -> Option<Prior> {
+        self.fresh_external(stamp_ns).map(|(at, known)| self.grown(stamp_ns, at, known))
+    }
+
+    fn fresh_external(&self, stamp_ns: i64) -> Option<(i64, &Known)> {
+        self.external.nearest(stamp_ns).filter(|(at, _)| age_s(stamp_ns, *at).abs() <= self.settings.max_prior_age_s)
     }
 
     /// An answer was given for a frame exposed at `stamp_ns`, with message number `seq`.
     pub fn record(&mut self, stamp_ns: i64, seq: u64, answer: &Answer) {
         let Ok(fix) = &answer.outcome else {
+            // Where nothing of ours is known there is nothing to lose.
+            if self.own.newest_first().next().is_none() {
+                return;
+            }
             self.no_fix_in_row = self.no_fix_in_row.saturating_add(1);
             if self.no_fix_in_row >= self.settings.fall_back_after_no_fix {
                 self.own.clear();
-                self.fixes.clear();
                 self.believed_from_seq = seq.saturating_add(1);
+                self.no_fix_in_row = 0;
             }
             return;
         };
@@ -203,13 +219,6 @@ impl Tracker {
 /// Seconds from `from_ns` to `to_ns`.
 pub(super) fn age_s(to_ns: i64, from_ns: i64) -> f64 {
     (i128::from(to_ns) - i128::from(from_ns)) as f64 / 1e9
-}
-
-/// Square root of the larger eigenvalue of a covariance, metres: no axis is worse.
-pub(super) fn largest_sigma_m(covariance_m2: &[[f64; 2]; 2]) -> f64 {
-    let [[ee, en], [_, nn]] = *covariance_m2;
-    let mean = 0.5 * (ee + nn);
-    (mean + (0.5 * (ee - nn)).hypot(en)).sqrt()
 }
 
 #[cfg(test)]

@@ -190,6 +190,20 @@ fn a_newer_external_prior_wins_over_the_own_fix() {
 }
 
 #[test]
+fn the_external_prior_is_known_beside_the_own_fix() {
+    let mut tracker = tracker();
+    assert_eq!(tracker.external_at(T0), None);
+    tracker.report(sigma(T0, 0.0, 10.0));
+    tracker.record(T0, 40, &fix(70.0, 3.0, None));
+    // An echo is no external prior.
+    tracker.report(PriorReport { fix_seq: Some(40), ..sigma(T0 + S, 90.0, 2.0) });
+    let prior = tracker.external_at(T0 + 2 * S).unwrap();
+    assert_eq!((prior.source, prior.position, prior.age_s), (PriorSource::External, place(0.0), Some(2.0)));
+    close(prior.radius_m, 180.0);
+    assert_eq!(tracker.external_at(T0 + 601 * S), None, "stale");
+}
+
+#[test]
 fn of_two_priors_one_that_can_be_searched_is_taken() {
     let after = T0 + 49 * S / 10;
     let own_then = |external_m: f64| {
@@ -227,15 +241,62 @@ fn an_echo_is_own_influence_not_an_external_prior() {
 }
 
 #[test]
-fn an_echo_of_a_fix_given_up_is_not_believed() {
+fn an_echo_of_a_fix_given_up_grows_since_that_fix_and_comes_last() {
     let mut tracker = tracker();
     tracker.report(radius(T0, 0.0, 300.0));
     tracker.record(T0, 0, &fix(70.0, 3.0, None));
     for seq in 1..=5 {
         tracker.record(T0, seq, &no_fix());
     }
-    assert!(!tracker.report(PriorReport { fix_seq: Some(0), ..sigma(T0 + S, 90.0, 2.0) }));
-    assert_eq!(tracker.prior_at(T0 + S).unwrap().source, PriorSource::External);
+    let echo = |at_s: i64| PriorReport { fix_seq: Some(0), ..sigma(T0 + at_s * S, 90.0, 2.0) };
+    assert!(tracker.report(echo(4)));
+    assert_eq!(tracker.prior_at(T0 + 4 * S).unwrap().source, PriorSource::External, "400 m can be searched");
+    // An external prior that cannot be searched any more gives way; 3 x (50 + 25 x 4 + 25) m can.
+    tracker.report(radius(T0 + 4 * S, 0.0, 600.0));
+    let prior = tracker.prior_at(T0 + 4 * S + S / 2).unwrap();
+    assert_eq!((prior.source, prior.chain, prior.position), (PriorSource::OwnFix, 2, place(90.0)));
+    close(prior.radius_m, 3.0 * (50.0 + 100.0 + 12.5));
+    // It vouches for nothing, and a fix of our own goes first again.
+    assert_eq!(tracker.external_at(T0 + 4 * S).unwrap().position, place(0.0));
+    tracker.record(T0 + 4 * S, 6, &fix(71.0, 3.0, Some(prior)));
+    assert!(tracker.report(echo(5)));
+    assert_eq!(tracker.prior_at(T0 + 5 * S).unwrap().position, place(71.0));
+    // However long the estimator has no newer fix of ours to state, it is heard.
+    for seq in 7..=11 {
+        tracker.record(T0 + 5 * S, seq, &no_fix());
+    }
+    let bound = PriorReport { fix_seq: Some(0), ..radius(T0 + 900 * S, 95.0, 200.0) };
+    assert!(tracker.report(bound));
+    let prior = tracker.prior_at(T0 + 900 * S).unwrap();
+    assert_eq!((prior.position, prior.radius_m), (place(95.0), 200.0 + 25.0 * 900.0));
+}
+
+#[test]
+fn an_echo_of_a_fix_that_is_forgotten_is_refused() {
+    let mut tracker = tracker();
+    for seq in 100..200 {
+        tracker.record(T0, seq, &fix(70.0, 3.0, None));
+    }
+    let echo = |seq| PriorReport { fix_seq: Some(seq), ..sigma(T0, 90.0, 60.0) };
+    assert!(!tracker.report(echo(135)), "of the 64 kept 136 is the oldest");
+    assert!(tracker.report(echo(136)));
+}
+
+#[test]
+fn an_echo_of_an_unknown_fix_is_not_believed_after_a_loss() {
+    let mut tracker = tracker();
+    let echo = PriorReport { fix_seq: Some(9000), ..sigma(T0, 90.0, 60.0) };
+    for seq in 1..=5 {
+        tracker.record(T0, seq, &no_fix());
+    }
+    assert!(tracker.report(echo), "frames before the first prior lose nothing");
+    for seq in 6..=9 {
+        tracker.record(T0, seq, &no_fix());
+    }
+    assert!(tracker.report(echo));
+    tracker.record(T0, 10, &no_fix());
+    assert!(!tracker.report(echo));
+    assert_eq!(tracker.prior_at(T0).unwrap_err().reason, Reason::NoPrior);
 }
 
 #[test]
@@ -250,10 +311,10 @@ fn an_echo_of_an_unknown_fix_counts_as_one_deep() {
 fn order_of_arrival_does_not_matter_and_the_future_grows_too() {
     let mut tracker = tracker();
     tracker.report(radius(T0 + 10 * S, 10.0, 100.0));
-    tracker.report(radius(T0, 0.0, 100.0));
+    tracker.report(radius(T0 + 9 * S, 0.0, 100.0));
     assert_eq!(tracker.prior_at(T0 + 11 * S).unwrap().position, place(10.0));
-    let prior = tracker.prior_at(T0 + 8 * S).unwrap();
-    assert_eq!((prior.position, prior.age_s), (place(10.0), Some(-2.0)));
+    let prior = tracker.prior_at(T0 + 7 * S).unwrap();
+    assert_eq!((prior.position, prior.age_s), (place(0.0), Some(-2.0)));
     close(prior.radius_m, 150.0);
 }
 
@@ -266,6 +327,24 @@ fn a_clock_that_steps_back_leaves_the_future_behind() {
     assert_eq!(tracker.prior_at(T0).unwrap_err().reason, Reason::StalePrior);
     tracker.report(radius(T0, 5.0, 100.0));
     assert_eq!(tracker.prior_at(T0).unwrap().position, place(5.0));
+}
+
+#[test]
+fn a_small_step_back_leaves_no_future_that_wins_by_stamp() {
+    let mut tracker = tracker();
+    for i in 0..30 {
+        let (stamp_ns, east_m) = (T0 + i * S, 20.0 * i as f64);
+        tracker.report(radius(stamp_ns, east_m, 100.0));
+        tracker.record(stamp_ns, i as u64, &fix(east_m, 3.0, None));
+    }
+    // 10 s back, while the vehicle goes on: nothing of the last flight between T0 + 20 s and T0 + 30 s holds now.
+    tracker.report(radius(T0 + 20 * S, 620.0, 100.0));
+    tracker.record(T0 + 20 * S, 30, &fix(620.0, 3.0, None));
+    for i in 20..30 {
+        let prior = tracker.prior_at(T0 + i * S).unwrap();
+        assert_eq!(prior.position, place(620.0));
+        assert_eq!(tracker.external_at(T0 + i * S).unwrap().position, place(620.0));
+    }
 }
 
 #[test]
