@@ -253,7 +253,9 @@ def turn(folder: Path, seed: int) -> None:
 
     def change(rows: list[dict]) -> list[dict]:
         turns = rng.integers(1, 4, len(rows))
-        return [row | {"yaw_deg": f"{(float(row['yaw_deg']) + 90.0 * n) % 360.0:.4f}"} for row, n in zip(rows, turns, strict=True)]
+        return [
+            row | {"yaw_deg": f"{(float(row['yaw_deg']) + 90.0 * n) % 360.0:.4f}"} for row, n in zip(rows, turns, strict=True)
+        ]
 
     rewrite(folder, change)
 

@@ -187,6 +187,12 @@ class Rung:
     scale_range: tuple[float, float] | None = None
 
 
+def commands(training: Path) -> list[str]:
+    """Every run of a training, the first first: `command-1.txt`, ..., `command.txt`."""
+    runs = [*sorted(training.glob("command-*.txt")), training / "command.txt"]
+    return [path.read_text().strip() for path in runs]
+
+
 def export(coarse_dir: Path, refine_dir: Path | None, out: Path, name: str, rung: Rung) -> dict[str, float]:
     """Writes the bundle, checked against torch; returns the largest difference of every golden output."""
     torch.manual_seed(0)
@@ -202,7 +208,7 @@ def export(coarse_dir: Path, refine_dir: Path | None, out: Path, name: str, rung
         "licence": "MIT",
         "provenance": {
             "description": "Light network of this project, trained on satellite maps with synthetic thermal frames.",
-            "command": " && ".join((folder / "command.txt").read_text().strip() for folder in trainings),
+            "command": " && ".join(command for folder in trainings for command in commands(folder)),
             "seed": json.loads((coarse_dir / "training.json").read_text())["seed"],
             "data": [
                 "dubai_t7, dubai_t8_east: CC0 (MBRSC / Humans in the Loop)",
