@@ -166,7 +166,10 @@ fn a_calibrated_bundle_states_its_error_and_its_gate_closes() {
     let mut bench = Bench::with_manifest(|_| (), |_, _| false, doubtful);
     assert_eq!(reason(&bench.locate(&frame, nadir(), prior(middle(), 128.0))), Reason::LowEvidence);
     let mut open = Bench::with_manifest(|gates| gates.enabled = false, |_, _| false, doubtful);
-    assert_eq!(open.locate(&frame, nadir(), prior(middle(), 128.0)).outcome.unwrap().p_over_25m, Some(0.5));
+    let answer = open.locate(&frame, nadir(), prior(middle(), 128.0));
+    assert_eq!(answer.withheld, Some(Reason::LowEvidence));
+    let fix = answer.outcome.unwrap();
+    assert_eq!((fix.calibrated, fix.p_over_25m), (false, None), "no calibration covers what a gate would have closed");
     // A cue that is missing closes the gate: what was not seen is not safe.
     let unknown = |m: &mut Manifest| {
         let mut table = calibration([0.001, 0.001]);

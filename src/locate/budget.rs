@@ -58,7 +58,7 @@ pub fn stated_error(
 }
 
 /// Of the angle between the optical axis and the vertical; beyond 60 degrees, where no frame is rectified, as there.
-fn cos_tilt(pose: &Pose) -> f64 {
+pub(super) fn cos_tilt(pose: &Pose) -> f64 {
     let cos = |deg: Option<f64>| deg.unwrap_or(0.0).to_radians().cos();
     (cos(pose.pitch_deg) * cos(pose.roll_deg)).max(0.5)
 }

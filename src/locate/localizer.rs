@@ -238,7 +238,7 @@ impl Localizer {
         // discs of D_C, and of what the gates let through.
         let fine = self.windows.map.map().m_per_px() <= MAX_CALIBRATED_PX * m_per_px;
         let whole = way.evidence.get("frame_valid").is_some_and(|share| *share >= MIN_CALIBRATED_SEEN);
-        let nadir = tilt_deg(&pose) <= MAX_CALIBRATED_TILT_DEG;
+        let nadir = budget::cos_tilt(&pose) >= MAX_CALIBRATED_TILT_DEG.to_radians().cos();
         let calibrated = search.yaw_known && scale == 1.0 && fine && whole && nadir && !searched && way.withheld.is_none();
         let seen_as = Seeing { pose: &pose, agl_m: way_frame.agl_m, scale, calibrated };
         let fix = self.fix(position, &found, &seen_as, judgement, &mut way.evidence);
@@ -373,12 +373,6 @@ struct OnTheWay {
     window: Option<WindowInfo>,
     evidence: Evidence,
     seen: Seen,
-}
-
-/// Between the camera's axis and the vertical, degrees; what is unknown counts as level.
-fn tilt_deg(pose: &Pose) -> f64 {
-    let cosine = |deg: Option<f64>| deg.unwrap_or(0.0).to_radians().cos();
-    (cosine(pose.pitch_deg) * cosine(pose.roll_deg)).clamp(-1.0, 1.0).acos().to_degrees()
 }
 
 fn no_window(error: WindowError) -> NoFix {

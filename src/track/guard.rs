@@ -1,7 +1,7 @@
 //! Consistency over frames: what no motion explains is held back until another frame agrees, a frozen picture is no news.
 //!
 //! Rules, each about one answer, in the order in which they are tested:
-//! 1. One of the last few pictures again, bit for bit, at another exposure: its fix holds for the first exposure, so its stated
+//! 1. One of the last few pictures again, bit for bit, at another exposure: its fix is that of the first exposure, and its stated
 //!    error grows by `max_speed_mps` x the time since; from the `frozen_frames`-th exposure, over `frozen_after_s`, on it is
 //!    `held_back`.
 //! 2. A fix outside the disc of the external prior nearest in time, grown by its age, is `held_back`, whichever prior led to
@@ -60,6 +60,8 @@ struct Picture {
     last_stamp_ns: i64,
     /// At different exposures.
     count: u32,
+    /// Of its first exposure that was answered: what attitude a later one states is not that of the picture.
+    fix: Option<Fix>,
 }
 
 /// Checks answers against those before them.
@@ -100,6 +102,14 @@ impl Guard {
             );
             answer.outcome = Err(NoFix::new(Reason::HeldBack, detail));
             return;
+        }
+        if let Some(picture) = self.pictures.back_mut().filter(|_| frame.is_some()) {
+            let first = picture.fix.get_or_insert_with(|| fix.clone());
+            if picture_age_s > 0.0 {
+                fix.position = first.position;
+                fix.covariance_enu_m2 = first.covariance_enu_m2;
+                (fix.radius95_m, fix.radius999_m) = (first.radius95_m, first.radius999_m);
+            }
         }
         if let Some(detail) = external.and_then(|external| contradicts(external, fix.position)) {
             answer.outcome = Err(NoFix::new(Reason::HeldBack, detail));
@@ -208,7 +218,8 @@ impl Guard {
         let Some(bytes) = frame else { return (0, 0.0) };
         let digest: [u8; 32] = Sha256::digest(bytes).into();
         let known = self.pictures.iter().position(|seen| seen.digest == digest).and_then(|i| self.pictures.remove(i));
-        let mut seen = known.unwrap_or(Picture { digest, first_stamp_ns: stamp_ns, last_stamp_ns: stamp_ns, count: 1 });
+        let mut seen =
+            known.unwrap_or(Picture { digest, first_stamp_ns: stamp_ns, last_stamp_ns: stamp_ns, count: 1, fix: None });
         // One exposure sent twice is no frozen camera.
         if seen.last_stamp_ns != stamp_ns {
             seen.count = seen.count.saturating_add(1);
