@@ -116,16 +116,7 @@ fn answer(
     let mut answer = if waited > deadline {
         // Too late already: the time is better spent on the next frame. An earlier reason goes first.
         let no_fix = query.prior.as_ref().err().cloned().unwrap_or_else(|| late(waited, deadline));
-        Answer {
-            withheld: None,
-            bundle: None,
-            searched: false,
-            outcome: Err(no_fix),
-            prior: query.prior.ok(),
-            window: None,
-            evidence: Default::default(),
-            latency_ms: Default::default(),
-        }
+        Answer::bare(Err(no_fix), query.prior.ok())
     } else {
         locate(&query)
     };

@@ -24,16 +24,8 @@ pub struct Outbox {
 impl Outbox {
     /// Nothing to send. Who asks is told that no prior was there yet: stamped with the start, message 0.
     pub fn new(health: &Health) -> Self {
-        let none = Answer {
-            withheld: None,
-            bundle: None,
-            searched: false,
-            outcome: Err(NoFix { reason: Reason::NoPrior, detail: "frame: expected one, found none since the start".to_owned() }),
-            prior: None,
-            window: None,
-            evidence: Default::default(),
-            latency_ms: Default::default(),
-        };
+        let detail = "frame: expected one, found none since the start";
+        let none = Answer::bare(Err(NoFix::new(Reason::NoPrior, detail)), None);
         let identity = health.identity();
         let message = FixMessage::new(now_ns(), 0, &none, &identity.bundle, &identity.map);
         Self { waiting: Newest::new(WAITING), last: Mutex::new((message, Instant::now())) }

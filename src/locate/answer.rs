@@ -123,3 +123,38 @@ pub struct Answer {
     /// Milliseconds by step.
     pub latency_ms: Latency,
 }
+
+impl Answer {
+    /// One of which nothing is known but its outcome and its prior.
+    pub fn bare(outcome: Result<Fix, NoFix>, prior: Option<Prior>) -> Self {
+        Self {
+            outcome,
+            withheld: None,
+            prior,
+            bundle: None,
+            searched: false,
+            window: None,
+            evidence: Evidence::new(),
+            latency_ms: Latency::new(),
+        }
+    }
+}
+
+#[cfg(test)]
+impl Fix {
+    /// For tests: unturned, of the refine stage, not calibrated; 1-sigma per axis, metres.
+    pub(crate) fn plain(position: LatLon, sigma_m: f64) -> Self {
+        Self {
+            position,
+            covariance_enu_m2: [[sigma_m * sigma_m, 0.0], [0.0, sigma_m * sigma_m]],
+            radius95_m: 1.0,
+            radius999_m: 1.0,
+            calibrated: false,
+            p_over_25m: None,
+            yaw_deg: 0.0,
+            scale: 1.0,
+            stage: StageName::Refine,
+            homography: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        }
+    }
+}

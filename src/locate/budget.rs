@@ -91,7 +91,7 @@ pub fn largest_sigma_m(covariance_m2: &[[f64; 2]; 2]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::locate::{Fix, StageName};
+    use crate::locate::Fix;
 
     const SETTINGS: BudgetSettings = BudgetSettings {
         sigma_tilt_deg: 0.5,
@@ -152,29 +152,10 @@ mod tests {
         let stated = |pose: &Pose| {
             let mut evidence = Evidence::new();
             let error = stated_error(&SETTINGS, 3.0, 5.0, pose, Some(400.0), &mut evidence);
-            let fix = Fix {
-                position: crate::geo::LatLon { lat_deg: 25.2, lon_deg: 55.3 },
-                covariance_enu_m2: error.covariance_enu_m2,
-                radius95_m: error.radius95_m,
-                radius999_m: error.radius999_m,
-                calibrated: true,
-                p_over_25m: None,
-                yaw_deg: 0.0,
-                scale: 1.0,
-                stage: StageName::Refine,
-                homography: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
-            };
-            let latency_ms = Default::default();
-            Answer {
-                outcome: Ok(fix),
-                withheld: None,
-                prior: None,
-                bundle: None,
-                searched: false,
-                window: None,
-                evidence,
-                latency_ms,
-            }
+            let home = crate::geo::LatLon { lat_deg: 25.2, lon_deg: 55.3 };
+            let StatedError { covariance_enu_m2, radius95_m, radius999_m } = error;
+            let fix = Fix { covariance_enu_m2, radius95_m, radius999_m, calibrated: true, ..Fix::plain(home, 1.0) };
+            Answer { evidence, ..Answer::bare(Ok(fix), None) }
         };
         let level = Pose { pitch_deg: Some(0.0), roll_deg: Some(0.0), ..Pose::default() };
         let (mut assumed, unknown) = (stated(&level), stated(&Pose::default()));

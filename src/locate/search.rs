@@ -18,7 +18,6 @@ use super::{Answer, Evidence, Latency, Localizer, NoFix, Prior, Query, Reason, S
 use crate::config::SearchSettings;
 use crate::geo::{Enu, LatLon};
 use crate::model::StageManifest;
-use std::collections::BTreeMap;
 
 /// Two answers nearer than this are the same place, metres: the bound of a wrong fix.
 const SAME_PLACE_M: f64 = 50.0;
@@ -326,14 +325,6 @@ fn stopped(what: &str) -> NoFix {
 }
 
 fn no_answer(localizer: &Localizer, prior: Option<Prior>, no_fix: NoFix) -> Answer {
-    Answer {
-        outcome: Err(no_fix),
-        withheld: None,
-        prior,
-        bundle: Some(localizer.bundle().manifest.name.clone()),
-        searched: true,
-        window: None,
-        evidence: BTreeMap::new(),
-        latency_ms: BTreeMap::new(),
-    }
+    let bundle = Some(localizer.bundle().manifest.name.clone());
+    Answer { bundle, searched: true, ..Answer::bare(Err(no_fix), prior) }
 }

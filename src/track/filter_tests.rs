@@ -3,7 +3,7 @@
 use super::*;
 use crate::bus::MapId;
 use crate::flight::noise::Dice;
-use crate::locate::{Answer, Fix, StageName};
+use crate::locate::{Answer, Fix};
 
 const S: i64 = 1_000_000_000;
 const HOME: LatLon = LatLon { lat_deg: 25.2, lon_deg: 55.3 };
@@ -13,28 +13,7 @@ fn settings() -> TrackSettings {
 }
 
 fn fix(stamp_ns: i64, seq: u64, at: Enu, sigma_m: f64) -> FixMessage {
-    let fix = Fix {
-        position: HOME.offset(at),
-        covariance_enu_m2: [[sigma_m * sigma_m, 0.0], [0.0, sigma_m * sigma_m]],
-        radius95_m: 1.0,
-        radius999_m: 1.0,
-        calibrated: false,
-        p_over_25m: None,
-        yaw_deg: 0.0,
-        scale: 1.0,
-        stage: StageName::Refine,
-        homography: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
-    };
-    let answer = Answer {
-        outcome: Ok(fix),
-        withheld: None,
-        prior: None,
-        bundle: None,
-        searched: false,
-        window: None,
-        evidence: Default::default(),
-        latency_ms: Default::default(),
-    };
+    let answer = Answer::bare(Ok(Fix::plain(HOME.offset(at), sigma_m)), None);
     FixMessage::new(stamp_ns, seq, &answer, "b", &MapId { name: "m".into(), digest: "0".into() })
 }
 

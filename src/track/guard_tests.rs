@@ -2,9 +2,7 @@
 
 use super::*;
 use crate::geo::Enu;
-use crate::locate::StageName;
 use proptest::prelude::*;
-use std::collections::BTreeMap;
 
 const S: i64 = 1_000_000_000;
 const T0: i64 = 1_700_000_000 * S;
@@ -30,29 +28,9 @@ fn own(at: LatLon) -> Prior {
 }
 
 fn answer(at: LatLon, prior: Prior) -> Answer {
-    let fix = Fix {
-        position: at,
-        covariance_enu_m2: [[9.0, 0.0], [0.0, 9.0]],
-        radius95_m: 7.3,
-        radius999_m: 11.2,
-        calibrated: true,
-        p_over_25m: Some(0.01),
-        yaw_deg: 0.0,
-        scale: 1.0,
-        stage: StageName::Refine,
-        homography: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
-    };
-    let (evidence, latency_ms) = (BTreeMap::new(), BTreeMap::new());
-    Answer {
-        outcome: Ok(fix),
-        withheld: None,
-        prior: Some(prior),
-        bundle: None,
-        searched: false,
-        window: None,
-        evidence,
-        latency_ms,
-    }
+    let (calibrated, p_over_25m) = (true, Some(0.01));
+    let fix = Fix { radius95_m: 7.3, radius999_m: 11.2, calibrated, p_over_25m, ..Fix::plain(at, 3.0) };
+    Answer::bare(Ok(fix), Some(prior))
 }
 
 fn searched(at: LatLon, radius_m: f64) -> Answer {

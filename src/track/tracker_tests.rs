@@ -2,8 +2,7 @@
 
 use super::*;
 use crate::geo::Enu;
-use crate::locate::{Fix, StageName};
-use std::collections::BTreeMap;
+use crate::locate::Fix;
 
 const S: i64 = 1_000_000_000;
 const T0: i64 = 1_700_000_000 * S;
@@ -28,38 +27,12 @@ fn sigma(stamp_ns: i64, east_m: f64, sigma_m: f64) -> PriorReport {
     PriorReport { spread: Spread::SigmaM(sigma_m), ..radius(stamp_ns, east_m, 1.0) }
 }
 
-fn answer(outcome: Result<Fix, NoFix>, prior: Option<Prior>) -> Answer {
-    Answer {
-        outcome,
-        withheld: None,
-        prior,
-        bundle: None,
-        searched: false,
-        window: None,
-        evidence: BTreeMap::new(),
-        latency_ms: BTreeMap::new(),
-    }
-}
-
 fn fix(east_m: f64, sigma_m: f64, prior: Option<Prior>) -> Answer {
-    let variance = sigma_m * sigma_m;
-    let fix = Fix {
-        position: place(east_m),
-        covariance_enu_m2: [[variance, 0.0], [0.0, variance]],
-        radius95_m: 1.0,
-        radius999_m: 1.0,
-        calibrated: false,
-        p_over_25m: None,
-        yaw_deg: 0.0,
-        scale: 1.0,
-        stage: StageName::Refine,
-        homography: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
-    };
-    answer(Ok(fix), prior)
+    Answer::bare(Ok(Fix::plain(place(east_m), sigma_m)), prior)
 }
 
 fn no_fix() -> Answer {
-    answer(Err(NoFix { reason: Reason::LowEvidence, detail: String::new() }), None)
+    Answer::bare(Err(NoFix::new(Reason::LowEvidence, "")), None)
 }
 
 fn close(a: f64, b: f64) {

@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import shlex
 import shutil
 import subprocess
 import sys
@@ -164,7 +165,7 @@ def main() -> None:
 def report(words: list[str], radius_m: float, text: str) -> str:
     """The page of a run: its command, what its numbers are, the table."""
     said = __doc__.split("\n\n", 2)[2].replace("D_C = 512 m", f"D_C = {radius_m:g} m")
-    return f"# The bar\n\n`python -m sthn.lite.bar {' '.join(words)}`\n\n{said}\n{text}\n"
+    return f"# The bar\n\n`python -m sthn.lite.bar {shlex.join(words)}`\n\n{said}\n{text}\n"
 
 
 def put_accuracy(bundle: Path, row: dict, radius_m: float, maps: list[str]) -> None:

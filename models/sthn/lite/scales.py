@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -99,7 +100,7 @@ def main(words: list[str] | None = None) -> None:
     drawn = supported([row for row in rows if row["over"] == "world"])
     print(json.dumps({"scale_range": [drawn, 1.0]}))
     if args.table:
-        command = " ".join(words if words is not None else sys.argv[1:])
+        command = shlex.join(words if words is not None else sys.argv[1:])
         args.table.parent.mkdir(parents=True, exist_ok=True)
         args.table.write_text(
             f"# Low flights\n\n`python -m sthn.lite.scales {command}`\n\n{__doc__.split(chr(10) * 2, 2)[2]}\n{text}\n"
